@@ -112,6 +112,15 @@ def recorded(size: tuple[int, int], *camera: Any, seed: int = 0, margin: int = M
     return torch.from_numpy(take_frames(scene, *camera, seed=seed, margin=margin)).float()
 
 
+def tone_errors(vibration: Any, motion: Motion) -> Tensor:
+    """Errors (3, 2) of the first tone of each axis: period %, amplitude %, phase in pi."""
+    truth = motion.vibration()
+    turn = torch.remainder(vibration.phase - truth.phase + np.pi, 2 * np.pi) - np.pi
+    period = 100 * (truth.frequency / vibration.frequency - 1)
+    amplitude = 100 * (vibration.amplitude / truth.amplitude - 1)
+    return torch.stack([period, amplitude, turn / np.pi])[..., 0].abs()
+
+
 def crop(scene: Array, margin: int = MARGIN) -> Array:
     """The part of the scene in frames of a camera at rest."""
     return scene[margin:-margin, margin:-margin]

@@ -33,8 +33,7 @@ def assembled(
     fit: ToneFit,
     std: VibrationStd,
     std_if_hidden_tone: VibrationStd | None,
-    curve: OffsetCurve,
-    fitted: Array,
+    offsets: tuple[OffsetCurve, Array],
     findings: Sequence[Findings],
     timing: SensorTiming,
     *,
@@ -43,23 +42,14 @@ def assembled(
     interval: float,
     blur: Array | None = None,
 ) -> DetectionResult:
-    """The results of B stacks in image axes.
+    """The results of B stacks in image axes, from the fit and the standard deviations of its vibration in px.
 
-    Args:
-        fit: Tones and image motion of each stack.
-        std: Their standard deviations, in px.
-        std_if_hidden_tone: The same with the allowance for a further tone; None for none.
-        curve: The measured offsets (B, P, N, A) in px.
-        fitted: (B, P, N, A) px, the offsets that the fit predicts.
-        findings: For each stack and each axis in row order, the reasons against it.
-        timing: The sensor, in image order.
-        scale: Components of the motion.
-        num_frames: Frames of a stack.
-        interval: Seconds between two frames, for the gain.
-        blur: (B, 3) as in ``OtherMotion``; None if it was not measured.
+    ``offsets`` are those that were measured and those (B, P, N, A) in px that the fit predicts; ``findings`` are the
+    reasons against each axis in row order; the timing is in image order, and ``interval`` in s is that between two
+    frames, for the gain. ``blur`` (B, 3) as in ``OtherMotion`` is None if it was not measured.
     """
-    row_timing = timing.in_row_order()
-    predicted = torch.from_numpy(fitted).to(curve.offsets.device)
+    row_timing, curve = timing.in_row_order(), offsets[0]
+    predicted = torch.from_numpy(offsets[1]).to(curve.offsets.device)
     units = scale.units(predicted)
     vibration = scale.motion(motion_of_fit(fit)).from_row_order(timing)
     sensitivity = timing_sensitivity(fit, row_timing, num_frames, scale.height)
@@ -94,17 +84,9 @@ def assembled(
 
 
 def offset_curve(
-    measurements: Measurements,
-    fit: ToneFit,
-    robust_weights: Array,
-    group_frames: Sequence[int],
-    device: torch.device,
+    measurements: Measurements, fit: ToneFit, robust_weights: Array, group_frames: Sequence[int], device: torch.device
 ) -> tuple[OffsetCurve, Array]:
-    """Measured offsets between consecutive frames, and those (B, P, N, A) in px that a fit predicts.
-
-    The measurements have the rows of all groups behind each other; neighbouring groups of ``group_frames`` share a
-    frame.
-    """
+    """Measured offsets between consecutive frames of groups, and those (B, P, N, A) in px that a fit predicts."""
     count = measurements.displacements.shape[1] // len(group_frames)
     parts = [
         (slice(number * count, (number + 1) * count), slice(frame, frame + 2))
@@ -123,9 +105,8 @@ def offset_curve(
     before, after = of_pairs(measurements.displacements)
     everywhere = replace(measurements, visible=np.ones_like(measurements.visible))
     fitted_before, fitted_after = of_pairs(model_displacements(everywhere, fit))
-    visible = of_pairs(measurements.visible).min(0) > 0
     weights, robust = of_rows(measurements.weights), of_rows(robust_weights)
-    measured = visible & (weights > 0).any(-1)
+    measured = (of_pairs(measurements.visible).min(0) > 0) & (weights > 0).any(-1)
     frames = np.arange(len(parts))
     values = {
         "pairs": np.stack([frames, frames + 1], -1),

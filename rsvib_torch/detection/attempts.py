@@ -43,16 +43,6 @@ class FieldOptions:
     zoom: bool | Literal["auto"]  # change of scale; includes roll
     camera: Camera | None  # focal length and lens; None for an infinite focal length
 
-    @property
-    def most_axes(self) -> int:
-        """Number of components, if roll and zoom are found."""
-        return 4 if self.zoom else 3 if self.roll else 2
-
-    @property
-    def least_axes(self) -> int:
-        """Number of components that were requested."""
-        return 4 if self.zoom is True else 3 if self.roll is True else 2
-
 
 def detect_tones(
     stacks: GreyFrames, timing: SensorTiming, options: DetectionOptions, field: FieldOptions
@@ -64,29 +54,34 @@ def detect_tones(
     # 1. Translation.
     translation = attempt(stacks, row_timing, options, Hypothesis(FieldScale(2, width, height)))
 
-    # 2. Roll and zoom. A requested component is measured in any case; frames that are too narrow for strips of columns
-    # are refused by an error then.
-    requested = field.camera is not None or field.least_axes > 2
-    possible = field.most_axes > 2 and _any_rolls(translation) and strips_fit(height, width, options.bands)
+    # 2. Roll and zoom, if they may be the cause of what the translation of any stack does not explain. A requested
+    # component is measured in any case; frames that are too narrow for strips of columns are refused by an error then.
+    least_axes = 4 if field.zoom is True else 3 if field.roll is True else 2
+    most_axes = 4 if field.zoom else 3 if field.roll else 2
+    refined = translation.fitted.refined
+    requested = field.camera is not None or least_axes > 2
+    possible = False
+    if refined is not None and most_axes > 2 and strips_fit(height, width, options.bands):
+        possible = bool(rotation_possible(refined.other_motion, refined.uneven, height / width).any())
     if requested or possible:
         hypothesis = Hypothesis(
-            FieldScale(field.most_axes, width, height, field.camera),
+            FieldScale(most_axes, width, height, field.camera),
             is_doubtful=not requested,
-            has_pattern=translation.has_pattern,
+            has_pattern=refined is not None and refined.has_pattern,
             translation=translation.fit,
         )
         rotation = attempt(stacks, row_timing, options, hypothesis)
         if requested or not rotation.abandoned.all():  # parallax otherwise
-            axes = _moving_axes(rotation, field.least_axes)
+            axes = _moving_axes(rotation, least_axes)
             if requested or axes > 2:
-                return assembled_attempt(rotation, timing, num_frames).with_axes(axes)
+                return _assembled(rotation, timing, num_frames).with_axes(axes)
 
     # 3. The same vibration of both halves.
     translation = _without_parallax(stacks, row_timing, options, translation)
 
     # 4. Another timing, for stacks whose rows the tones do not explain. The axes of a stack have one timing: of 9
     # reliable axes beside a contradicted one, 3 were wrong.
-    result = assembled_attempt(translation, timing, num_frames)
+    result = _assembled(translation, timing, num_frames)
     reliable, findings = result.reliable.clone(), list(result.findings)
     for index, reason in other_timings(stacks, timing, translation).items():
         reliable[index] = False
@@ -94,29 +89,21 @@ def detect_tones(
     return replace(result, reliable=reliable, findings=tuple(findings))
 
 
-def assembled_attempt(found: Attempt, timing: SensorTiming, num_frames: int) -> DetectionResult:
+def _assembled(found: Attempt, timing: SensorTiming, num_frames: int) -> DetectionResult:
     """The results of an attempt in image axes."""
+    fitted = found.fitted
     return assembled(
         found.fit,
         found.std,
         found.std_if_hidden_tone,
-        found.fitted.offsets,
-        found.fitted.predicted,
+        (fitted.offsets, fitted.predicted),
         found.findings,
         timing,
         scale=found.scale,
         num_frames=num_frames,
         interval=found.interval,
-        blur=None if found.fitted.refined is None else found.fitted.refined.other_motion.blur,
+        blur=None if fitted.refined is None else fitted.refined.other_motion.blur,
     )
-
-
-def _any_rolls(found: Attempt) -> bool:
-    """Whether roll or zoom may be the cause of what the translation of any stack does not explain."""
-    refined = found.fitted.refined
-    if refined is None:
-        return False
-    return bool(rotation_possible(refined.other_motion, refined.uneven, found.scale.height / found.scale.width).any())
 
 
 # -, px; differences between displacements of a half and of the whole. Of 16 recordings with parallax, 5 were accepted
@@ -157,10 +144,7 @@ def _without_parallax(stacks: GreyFrames, timing: RowTiming, options: DetectionO
 
 
 def _moving_axes(found: Attempt, least: int) -> int:
-    """Number of components up to the last one with a significant tone in any stack, at least ``least``.
-
-    A given number of tones is fitted to all components, also to those that do not move.
-    """
+    """Number of components up to the last one with a significant tone in any stack, at least ``least``."""
     significant = found.vibration.amplitude > MIN_SIGNIFICANCE * found.std_if_hidden_tone.amplitude
     moving = significant.any(0).any(-1).tolist()
     return max([least, *(axis + 1 for axis in range(2, len(moving)) if moving[axis])])

@@ -35,11 +35,6 @@ class Step:
         before, after = (model_displacements(measurements, fit) for fit in (warped_by, fitted))
         return cls(after, after - before)
 
-    def ratio_to(self, previous: "Step") -> Array:
-        """(B,) length of the step over the length of the previous one."""
-        square, previous_square = (np.square(step.change).sum((1, 2, 3)) for step in (self, previous))
-        return np.sqrt(square / np.maximum(previous_square, 1e-30))
-
     def is_inexact_after(self, previous: "Step") -> Array:
         """(B,) bool, whether the previous step was too short or too long by more than 30 %: this one corrects it."""
         product = (self.change * previous.change).sum((1, 2, 3))
@@ -81,15 +76,14 @@ class Acceleration:
 
     def ratio(self, step: Step) -> Array | None:
         """(B,) length of a step over the length of the last one; None if there is none."""
-        return step.ratio_to(self.steps[-1]) if self.steps else None
+        if not self.steps:
+            return None
+        square, previous_square = (np.square(one.change).sum((1, 2, 3)) for one in (step, self.steps[-1]))
+        return np.sqrt(square / np.maximum(previous_square, 1e-30))
 
     def add(self, step: Step, *, same_tones: bool) -> None:
         """Keep a step; steps with other tones do not predict the next one."""
         self.steps = [*self.steps[1 - _KEPT :], step] if same_tones else [step]
-
-    def clear(self) -> None:
-        """Forget all steps."""
-        self.steps = []
 
     def applied(self, measurements: Measurements, fit: ToneFit) -> ToneFit | None:
         """The fit to the corrected measurements of the last step; None if the last two steps need no correction."""
@@ -113,5 +107,4 @@ class Acceleration:
         ridge = 1e-3 * np.maximum(gram.diagonal(axis1=-2, axis2=-1).mean(-1), 1e-30)
         share = np.linalg.solve(gram + ridge[:, None, None] * np.eye(len(pairs)), right)[..., 0]
         share = np.clip(share, -_MAX_EXTRAPOLATION, _MAX_EXTRAPOLATION) * where[:, None]
-        correction: Array = (fitted * share[:, None, None, None]).sum(-1)
-        return correction
+        return (fitted * share[:, None, None, None]).sum(-1)

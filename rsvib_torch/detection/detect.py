@@ -14,7 +14,6 @@ from rsvib_torch.execution.precision import full_precision, without_gradients
 from rsvib_torch.frames.entry_points import TimedModule, frames_options, module_options
 from rsvib_torch.frames.grey import grey_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles
-from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import VibrationOptions
 
@@ -78,27 +77,21 @@ def detect_vibration(frames: FramesOrFiles, timing: SensorTiming, options: Vibra
     timing = stacks.timing
     height, width = stacks.images.shape[-2:]
     camera = camera_in_row_order(options, (height, width), timing)
-    field = _checked_field(options, camera)
+    field = FieldOptions(options.roll, options.zoom, camera)
     model = MotionModel(options.harmonics, 2 if options.image_acceleration else 1)
     chosen = DetectionOptions(options.method, None if options.tones == "auto" else options.tones, model, options)
     if options.columns is not None:
-        stacks = stacks.narrowed(options.columns)
+        if camera is not None or options.roll is True or options.zoom is True:
+            raise ValueError(
+                f"columns={options.columns} goes with roll=False, zoom=False and focal_length=None: roll, zoom and "
+                "perspective are measured from all columns"
+            )
+        stacks, field = stacks.narrowed(options.columns), FieldOptions(False, False, None)
 
     # 2. One result from all frames.
     with threads_for(stacks.images):
         result = detect_tones(stacks, timing, chosen, field)
     return result if stacks.batched else result[0]
-
-
-def _checked_field(options: VibrationOptions, camera: Camera | None) -> FieldOptions:
-    """The options of roll and zoom, which are not measured of a part of the columns."""
-    all_columns, roll, zoom = options.columns is None, options.roll, options.zoom
-    if not all_columns and (camera is not None or roll is True or zoom is True):
-        raise ValueError(
-            f"columns={options.columns} goes with roll=False, zoom=False and focal_length=None: roll, zoom and "
-            "perspective are measured from all columns"
-        )
-    return FieldOptions(all_columns and roll, all_columns and zoom, camera)
 
 
 class VibrationDetector(TimedModule):

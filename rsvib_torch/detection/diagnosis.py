@@ -25,10 +25,7 @@ from rsvib_torch.results.reason import Reason
 
 
 def other_timings(stacks: GreyFrames, timing: SensorTiming, found: Attempt) -> dict[int, Reason]:
-    """The reasons against all axes of stacks that agree with another timing, by the index of the stack.
-
-    ``found`` is the attempt with the stated timing, in image order.
-    """
+    """The reasons against all axes of stacks that agree with another timing than the attempt, by index of the stack."""
     if found.fitted.refined is None:
         return {}
     diagnoses, rotates = {}, halves_move_apart(found.fitted.refined.other_motion).tolist()
@@ -42,12 +39,11 @@ def other_timings(stacks: GreyFrames, timing: SensorTiming, found: Attempt) -> d
 
 
 def _diagnosis(
-    stack: GreyFrames, timing: SensorTiming, found: Attempt, index: int, axes: tuple[bool, bool], *, rotates: bool
+    stack: GreyFrames, timing: SensorTiming, found: Attempt, index: int, axes: list[bool], *, rotates: bool
 ) -> Reason | None:
     """The reason against all axes of a stack that agrees with another timing; None if it agrees with none.
 
-    ``axes`` (x, y) in row order contradict the stated timing; ``rotates`` states that the halves of the rows move
-    apart, as they do with the wrong scan axis.
+    ``axes`` (x, y) in row order contradict the stated one; ``rotates``: whether the halves of the rows move apart.
     """
     num_frames, height, width = stack.images.shape[1:]
     only = slice(index, index + 1)
@@ -56,9 +52,7 @@ def _diagnosis(
     # the phase from frame to frame agree with one period of the frames.
     candidates: list[tuple[SensorTiming, Array | None]] = []
     measurements = take_stacks([found.fitted.measurements], np.array([index]))
-    agreeing = None
-    if num_frames > 2:
-        agreeing = period_factor(measurements, timing.in_row_order(), num_frames, BLOCK_ROWS)
+    agreeing = period_factor(measurements, timing.in_row_order(), num_frames) if num_frames > 2 else None
     if agreeing is not None:
         factor, tones = agreeing
         if factor < 0:
@@ -115,22 +109,19 @@ _ITERATIONS = 5  # of fits; most factors are wrong, and their fits converge slow
 _MINIMA, _EQUAL = 4, 4.0  # minima that are refined, and their squared residual over the least to count as equal
 
 
-def period_factor(
-    measurements: Measurements, timing: RowTiming, num_frames: int, block_rows: int
-) -> tuple[float, Array] | None:
+def period_factor(measurements: Measurements, timing: RowTiming, num_frames: int) -> tuple[float, Array] | None:
     """Factor c of the frame start times with which one tone along each axis explains the measurements best.
 
-    A row ``i`` of frame ``p`` starts its exposure at ``s_p + i row_time``. With the factor c, it is ``c s_p``: the rows
-    of a frame and the phase from frame to frame must agree with the same frequency, which determines c. Reversed
-    readout is c = -1, because a vibration in reversed time is a vibration. The measurements are those of one stack of
-    at least three frames, in row order; ``block_rows`` limit the frequency of the tones.
+    A row ``i`` of frame ``p`` starts its exposure at ``c s_p + i row_time``: the rows of a frame and the phase from
+    frame to frame must agree with the same frequency, which determines c. Reversed readout is c = -1, because a
+    vibration in reversed time is a vibration. The measurements are those of one stack of at least three frames.
 
     Returns:
         c, 0.8 to 1.5, or -1, and the frequencies (1, 2, 1) in Hz of the tones; None if none explains the displacements
         clearly better than 1.
     """
     starts = table(timing.frame_starts(num_frames))
-    interval = max(block_rows * timing.row_time, 0.5 * timing.exposure_time)
+    interval = max(BLOCK_ROWS * timing.row_time, 0.5 * timing.exposure_time)
 
     def fits(factors: Array, rows: int, frequencies: Array | None = None) -> tuple[Array, Array]:
         """Square of the residual of one tone along each axis and its frequency, for each factor."""

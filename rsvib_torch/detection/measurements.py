@@ -5,7 +5,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 
 import math
 from copy import copy
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,12 +17,10 @@ from rsvib_torch.numerics.tables import Array, median, split_axis, take_stacks, 
 class Measurements:
     """Displacements of scene rows in the frames of a batch of stacks, in row order.
 
-    With roll and zoom, displacements have three or four components instead of two, those of ``motion.field`` times a
-    length in px (``detection.strips``).
-
     Every scene row n is measured in a group of G frames (two of them give an offset). The position of the scene itself
     is unknown, so only differences within a group are measured: the mean over the group is subtracted from the
-    displacements, and from every model that is compared with them.
+    displacements, and from every model that is compared with them. With roll and zoom, displacements have three or four
+    components instead of two, those of ``motion.field`` times a length in px (``detection.strips``).
     """
 
     exposure_starts: Array  # (B, N, G) float64 s, exposure start of the row of each frame that contains scene row n
@@ -43,28 +41,6 @@ class Measurements:
     # (B, N, G, A, Q) vectors v over the frames of each row; displacements and models are multiplied by 1 - sum v v^T,
     # which weakens errors that have their direction. None for none
     weakened: Array | None = None
-
-    @classmethod
-    def of_pairs(
-        cls,
-        starts: Array,
-        later_starts: Array,
-        offsets: Array,
-        information: Array,
-        exposure_time: float,
-        average_times: tuple[float, float] = (0.0, 0.0),
-        independent: float = 1.0,
-    ) -> "Measurements":
-        """Measurements of offsets (B, N, 2) between rows whose exposures start at the two given times (B, N)."""
-        return cls(
-            np.stack([starts, later_starts], -1),
-            np.stack([-0.5 * offsets, 0.5 * offsets], -2),
-            np.ones((*starts.shape, 2)),
-            2.0 * information,  # of each of the two displacements, which are equal and opposite
-            exposure_time,
-            average_times,
-            independent,
-        )
 
     @cached_property
     def _mean_weights(self) -> Array:
@@ -132,11 +108,7 @@ class Measurements:
 
     @property
     def _expected(self) -> Array:
-        """(B, N, A) inverse variances that residuals of each axis are compared with.
-
-        x and y of a row are nearly independent. With roll and zoom, x and roll are not: the displacement along x
-        determines ``X - theta y``, so that the information of x alone is far above its inverse variance at large y.
-        """
+        """(B, N, A) inverse variances that residuals are compared with; x determines roll, but hardly y, of a row."""
         return self.weights if self.information.shape[-1] == 2 else self.inverse_variances
 
     @property
@@ -159,19 +131,12 @@ class Measurements:
         names = ("exposure_starts", "displacements", "visible", "information")
         return replace(self, **{name: getattr(self, name)[:, rows] for name in names})
 
-    def only(self, counts: Array) -> "Measurements":
-        """The measurements with information 0 in the rows where ``counts`` (B, N) is False."""
-        return self._with_information(self.information * counts[..., None, None])
-
     def scaled(self, factor: Array) -> "Measurements":
         """The measurements with their information multiplied by factors (B, N, 2) of each axis."""
         root = np.sqrt(factor)
-        return self._with_information(self.information * root[..., :, None] * root[..., None, :])
-
-    def _with_information(self, information: Array) -> "Measurements":
-        """The same displacements with other information; cached values are kept if they depend on times only."""
+        # cached values are kept if they depend on times only
         result = copy(self)
-        object.__setattr__(result, "information", information)
+        object.__setattr__(result, "information", self.information * root[..., :, None] * root[..., None, :])
         for name in ("root", "inverse_variances"):
             result.__dict__.pop(name, None)
         return result
@@ -189,10 +154,7 @@ class Measurements:
     # Residuals of a fit, (B, N, G, 2) px
 
     def square(self, residual: Array) -> Array:
-        """(B, 2) sum of the squared residuals of each axis over their variance.
-
-        The residuals of one axis do not affect the sum of the other.
-        """
+        """(B, 2) sum of the squared residuals of each axis over their variance."""
         return np.einsum("bnga,bna->ba", np.square(residual), self.inverse_variances)
 
     def sizes(self, residual: Array) -> Array:
@@ -201,62 +163,58 @@ class Measurements:
 
     def distances(self, residual: Array) -> Array:
         """(B, N, 2) rms residual of each row in px; NaN where nothing was measured."""
-        measured = (self.weights > 0) & (self.num_differences[..., None] > 0)
-        square = np.square(residual).sum(2) / np.maximum(self.num_differences[..., None], 1.0)
-        return np.where(measured, np.sqrt(square), np.nan)
+        return np.sqrt(self._squares(residual))
+
+    def _squares(self, residual: Array) -> Array:
+        """(B, N, 2) px^2, mean square of the residuals of each row; NaN where nothing was measured."""
+        differences = self.num_differences[..., None]
+        measured = (self.weights > 0) & (differences > 0)
+        return np.where(measured, np.square(residual).sum(2) / np.maximum(differences, 1.0), np.nan)
 
     def unexplained(self, residual: Array) -> Array:
         """(B, 2) px, rms residual without the part that is explained by noise."""
-        measured = (self.weights > 0) & (self.num_differences[..., None] > 0)
-        square = np.square(residual).sum(2) / np.maximum(self.num_differences[..., None], 1.0)
-        excess = square - 1 / np.maximum(self._expected, 1e-300)
-        return np.sqrt(np.maximum(trimmed_mean(np.where(measured, excess, np.nan)), 0.0))
+        excess = self._squares(residual) - 1 / np.maximum(self._expected, 1e-300)
+        return np.sqrt(np.maximum(trimmed_mean(excess), 0.0))
 
-    def correlated(self, residual: Array, *, significance: float = 1.645) -> Array:
+    def correlated(self, residual: Array) -> Array:
         """(B, 2) px, root of the weighted mean product of the residuals of neighbouring rows.
 
         Noise is independent from row to row and does not contribute; an unmodelled motion, and a wrong timing, displace
-        neighbouring rows alike. Rows with clouds have a small weight. 0 if the mean is below ``significance`` of its
-        standard deviations (1.645: 95 %).
+        neighbouring rows alike. Rows with clouds have a small weight. 0 if the mean is not significant (95 %).
         """
         weight = self.weights[:, 1:] * self.weights[:, :-1]
         product = (residual[:, 1:] * residual[:, :-1]).sum(2) / np.maximum(self.num_differences[:, 1:, None], 1.0)
         total, deviation = (weight * product).sum(1), np.sqrt(np.square(weight * product).sum(1))
-        return np.sqrt(np.where(total > significance * deviation, total / np.maximum(weight.sum(1), 1e-300), 0.0))
+        return np.sqrt(np.where(total > 1.645 * deviation, total / np.maximum(weight.sum(1), 1e-300), 0.0))
 
     def common_of_groups(self, residual: Array) -> Array:
         """(B, 2) px, residual that most rows of a group of frames have in common with their neighbours; of the largest.
 
         The displacement of a group as a whole does not count. Clouds may cover half of its rows.
         """
-        rows = split_axis(
-            np.where(np.isnan(self.distances(residual))[:, :, None], np.nan, residual), 1, self.groups, -1
-        )
+        known = np.where(np.isnan(self._squares(residual))[:, :, None], np.nan, residual)
+        rows = split_axis(known, 1, self.groups, -1)
         rows = rows - median(rows, 2, keepdims=True)  # (B, groups, rows, G, 2)
         product = (rows[:, :, 1:] * rows[:, :, :-1]).sum(3)
         differences = np.maximum(split_axis(self.num_differences, 1, self.groups, -1)[:, :, 1:, None], 1.0)
         common = without_nan(median(product / differences, 2), 0.0)
         return np.sqrt(np.maximum(common.max(1), 0.0))
 
-    def independent_fraction(self, residual: Array, *, lags: int = 4) -> Array:
+    def independent_fraction(self, residual: Array) -> Array:
         """(B,) fraction of the rows that are independent, from the correlation rho(k) of residuals k rows apart.
 
         Errors of the model correlate the residuals of neighbouring rows, and the variance of a mean is larger by
-        ``1 + 2 sum rho(k)``, k = 1 ... ``lags``.
+        ``1 + 2 sum rho(k)``, k = 1 ... 4.
         """
         scaled = residual * np.sqrt(self._expected)[:, :, None]
         energy = np.maximum(np.square(scaled).sum((1, 2, 3)), 1e-300)
-        products = [(scaled[:, lag:] * scaled[:, :-lag]).sum((1, 2, 3)) for lag in range(1, lags + 1)]
+        products = [(scaled[:, lag:] * scaled[:, :-lag]).sum((1, 2, 3)) for lag in range(1, 5)]
         return 1.0 / np.maximum(1.0 + 2.0 * np.stack(products).sum(0) / energy, 1.0)
 
     # Robust weights
 
     def _sizes_for_weights(self, residual: Array) -> Array:
-        """``sizes``; with roll and zoom one of all axes of a row together.
-
-        Unequal weights of correlated components would mix them: a smaller weight of x alone turns the precise
-        combination ``X - theta y`` into another one.
-        """
+        """``sizes``; with roll and zoom one of all axes of a row: unequal weights would mix correlated components."""
         axes = self.information.shape[-1]
         if axes == 2:
             return self.sizes(residual)
@@ -288,10 +246,7 @@ class Measurements:
         return np.minimum(apparent / np.maximum(actual, 1e-300), 1.0)
 
     def _biweight_argument(self, residual: Array) -> Array:
-        """(B, N, 2) rms residual over 6 robust standard deviations, at most 1; 1 where nothing was measured.
-
-        With this limit the biweight is 98 % efficient for Gaussian errors.
-        """
+        """(B, N, 2) rms residual over 6 robust standard deviations (98 % efficient), at most 1; 1 if not measured."""
         size = self._sizes_for_weights(residual)
         spread = 1.4826 * median(size, 1, keepdims=True)
         return np.minimum(without_nan(size / (6.0 * np.maximum(without_nan(spread, 1.0), 1e-9)), 1.0), 1.0)
@@ -329,7 +284,7 @@ class OtherMotion:
             unexplained=np.maximum(unexplained, np.where(common > _AT_OTHERS * size, common, 0.0)),
             correlated=measurements.correlated(residual),
             differential=differential,
-            measured=measured.astype(np.float64).sum(1) / np.maximum(visible.astype(np.float64).sum(1), 1.0),
+            measured=measured.sum(1) / np.maximum(visible.sum(1), 1),
             blur=np.broadcast_to(np.array([1.0, 0.0, 0.0]), (len(residual), 3)),
         )
 
@@ -342,10 +297,6 @@ class OtherMotion:
     def explained(self) -> Array:
         """(...) bool, whether the rest of all axes is permitted; not where no row was measured."""
         return np.all(self.unexplained <= self.permitted, -1)
-
-    def __getitem__(self, index: int) -> "OtherMotion":
-        """The part of one stack out of a batch."""
-        return OtherMotion(*(getattr(self, field.name)[index] for field in fields(self)))
 
 
 def cholesky_root(information: Array) -> Array:
@@ -363,9 +314,9 @@ def cholesky_root(information: Array) -> Array:
     return root
 
 
-def trimmed_mean(values: Array, *, fraction: float = 0.7) -> Array:
-    """Mean (B, A) of the smallest ``fraction`` of values (B, N, A) without NaN; clouds may cover the other rows."""
+def trimmed_mean(values: Array) -> Array:
+    """Mean (B, A) of the smallest 70 % of values (B, N, A) without NaN; clouds may cover the other rows."""
     ordered = np.sort(values, 1)  # NaN come last
-    count = np.ceil((~np.isnan(values)).sum(1, keepdims=True).astype(np.float32) * fraction)
+    count = np.ceil((~np.isnan(values)).sum(1, keepdims=True).astype(np.float32) * 0.7)
     counted = np.arange(values.shape[1])[None, :, None] < count
     return np.where(counted, ordered, 0.0).sum(1) / np.maximum(count[:, 0], 1)

@@ -14,7 +14,7 @@ import numpy as np
 
 from rsvib_torch.detection.assemble import offset_curve
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.refinement import FittedRows, covariance_of_changes, refine, with_better
+from rsvib_torch.detection.refinement import FittedRows, refine, with_better
 from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_intervals
 from rsvib_torch.detection.rows.grouped_frames import grouped_frames, grouped_strips
 from rsvib_torch.detection.start import BandStart, band_start, field_start
@@ -39,7 +39,7 @@ from rsvib_torch.detection.tones.uncertainty import (
     with_weak_aliasing,
     without_aliasing,
 )
-from rsvib_torch.detection.verdict import BandOffsets, Findings, judged, scene_reasons, with_reasons_of_all
+from rsvib_torch.detection.verdict import Findings, compared_bands, judged, scene_reasons, with_reasons_of_all
 from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd, blind_frequencies
@@ -105,11 +105,6 @@ class Attempt:
     interval: float  # seconds between the first two frames
 
     @property
-    def has_pattern(self) -> bool:
-        """Whether a pattern of columns was subtracted."""
-        return self.fitted.refined is not None and self.fitted.refined.has_pattern
-
-    @property
     def abandoned(self) -> Array:
         """(B,) bool, stacks for which the hypothesis is wrong."""
         refined = self.fitted.refined
@@ -130,15 +125,13 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
 
     # 1. Start: the offsets of row bands between consecutive frames, and the tones that are known.
     if scale.same_for_all_columns:
-        start = band_start(
-            stacks, timing, options.bands, mere_start=not method.needs_whole_curve, known=hypothesis.known_offsets
-        )
+        known = hypothesis.known_offsets
+        start = band_start(stacks, timing, options.bands, known, mere_start=not method.needs_whole_curve)
     else:
         start = field_start(stacks, timing, options.bands, scale, hypothesis.translation)
     if hypothesis.frequencies is not None:
         active = np.ones_like(hypothesis.frequencies, dtype=bool)
-        known, _ = robust_fit(start.measurements, hypothesis.frequencies, active, options.model)
-        start = replace(start, fit=known)
+        start = replace(start, fit=robust_fit(start.measurements, hypothesis.frequencies, active, options.model)[0])
 
     # 2. Fit: tones and image motion, to the bands or to the rows.
     fitted = method.fit(start, stacks, timing, options, hypothesis)
@@ -146,31 +139,30 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
     # 3. Uncertainty: what the residual does not contain. Fits with hardly more measurements than parameters are exact
     # for any errors; a part of the scene has the same errors in all frames; aliasing biases the displacements; the
     # record may contain a further tone. The displacement is that of every eighth row of all frames.
-    intervals = table(compared_intervals(timing, num_frames, method.max_group_frames))
+    intervals = compared_intervals(timing, num_frames, method.max_group_frames)
     row_starts = table(timing.row_starts(num_frames, height)[:, ::8].flatten())
     measurements = fitted.measurements
-    if fitted.refined is None:
+    refined = fitted.refined
+    if refined is None:
         fit = with_unknown_errors(measurements, fitted.fit)
     else:
-        measurements, fit = _with_errors_of_scene(fitted.refined, fitted.fit, intervals, timing)
+        measurements, fit = _with_errors_of_scene(refined, fitted.fit, intervals, timing)
         small = too_small(fit, intervals, timing.exposure_time) & (fit.amplitude < fit.amplitude.max(-1, keepdims=True))
         if options.max_tones < math.inf and small.any():  # aliasing was taken for further tones
             kept = fit_tones(measurements, fit, fit.active & ~small, fit.model)
-            measurements, fit = _with_errors_of_scene(fitted.refined, kept, intervals, timing)
+            measurements, fit = _with_errors_of_scene(refined, kept, intervals, timing)
     known_std = displacement_std(fit, row_starts, timing.exposure_time)
     stated, if_hidden = with_further_tones(measurements, fit, row_starts, number_is_known=options.tones is not None)
     vibration, std = stated.vibration()
     fit, std_if_hidden_tone = if_hidden.fit, if_hidden.vibration()[1]
 
     # 4. Verdict: for each axis, the reasons against it, from the rows or the bands that the vibration was fitted to.
-    moved = tone_displacements(fit, row_starts, timing.exposure_time)
-    refined = fitted.refined
     findings = judged(
         vibration,
         std_if_hidden_tone,
         _band_offsets(start, fit, options, height) if refined is None else refined.other_motion,
         intervals=intervals,
-        displacement=moved.std(1),
+        displacement=tone_displacements(fit, row_starts, timing.exposure_time).std(1),
         known_std=known_std,
         timing=timing,
         max_tones=options.max_tones,
@@ -179,18 +171,8 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
     if scale.same_for_all_columns:
         against = zip(scene_reasons(start.curve, scale.width), findings, strict=True)
         findings = tuple(with_reasons_of_all(of_scene, of_stack) for of_scene, of_stack in against)
-    return Attempt(
-        options=options,
-        scale=scale,
-        start=start,
-        fitted=fitted,
-        fit=fit,
-        vibration=vibration,
-        std=std,
-        std_if_hidden_tone=std_if_hidden_tone,
-        findings=findings,
-        interval=float(intervals[0]),
-    )
+    interval = float(intervals[0])
+    return Attempt(options, scale, start, fitted, fit, vibration, std, std_if_hidden_tone, findings, interval)
 
 
 def _with_errors_of_scene(
@@ -199,7 +181,7 @@ def _with_errors_of_scene(
     """The rows in which aliasing has less weight, and the fit with what it and the scene add to its uncertainty."""
     measurements = with_weak_aliasing(refined.measurements, fit)
     fit = fitted_again(measurements, fit)
-    fit = replace(fit, covariance=fit.covariance + covariance_of_changes(refined.unknown))
+    fit = replace(fit, covariance=fit.covariance + refined.unknown)
     fit = with_errors_of_blocks(measurements, fit)
     fit = without_aliasing(measurements, fit, refined.aliasing)
     unexplained = refined.other_motion.unexplained
@@ -208,17 +190,14 @@ def _with_errors_of_scene(
     )
 
 
-def _band_offsets(start: BandStart, fit: ToneFit, options: DetectionOptions, height: int) -> BandOffsets:
-    """The offsets of the row bands with those that a fit predicts."""
-    curve, predicted = start.curve, start.predicted(fit)
-    offsets, rows = tables(curve.offsets, curve.rows)
+def _band_offsets(start: BandStart, fit: ToneFit, options: DetectionOptions, height: int) -> dict[str, Array]:
+    """``compared_bands`` of the offsets of the row bands and of those that a fit predicts."""
+    (offsets, rows), predicted = tables(start.curve.offsets, start.curve.rows), start.predicted(fit)
     # an image motion may carry bands out of the later frame
     later, half = rows + predicted[..., 1], 0.5 * options.bands.band_rows
     visible = (later >= half) & (later <= height - 1 - half)
-    stacks, axes = len(offsets), offsets.shape[-1]
-    return BandOffsets(
-        offsets.reshape(stacks, -1, axes), predicted.reshape(stacks, -1, axes), visible.reshape(stacks, -1)
-    )
+    flat = (len(offsets), -1, offsets.shape[-1])
+    return compared_bands(offsets.reshape(flat), predicted.reshape(flat), visible.reshape(flat[:2]))
 
 
 # Methods of detection
@@ -226,11 +205,11 @@ def _band_offsets(start: BandStart, fit: ToneFit, options: DetectionOptions, hei
 
 @dataclass(frozen=True)
 class Method:
-    """A method of detection: ``fit(start, stacks, timing, options, hypothesis)`` -> ``Fitted``.
+    """A method of detection.
 
-    The arguments of ``fit`` are the start with the offset curve (B, P, N) of row bands, the grey frames (B, T, H, W)
-    in row order, the sensor in row order, the options, and the hypothesis. Stacks of a batch have the same components
-    and groups of frames, and must not affect each other otherwise.
+    Its function has the start with the offset curve (B, P, N) of row bands, the grey frames (B, T, H, W) and the sensor
+    in row order, the options, and the hypothesis. Stacks of a batch have the same components and groups of frames, and
+    must not affect each other otherwise.
     """
 
     fit: Callable[[BandStart, GreyFrames, RowTiming, DetectionOptions, Hypothesis], Fitted]  # the function
@@ -253,7 +232,7 @@ def fit_directly(
     """The fit to bands, refined on the images row by row."""
     # The gradients of rows reach a few tenths of a pixel, so that a start with an error of 0.15 px converges.
     fit = _tones_of_bands(start, timing, options, accuracy=0.15)
-    intervals = table(compared_intervals(timing, stacks.images.shape[1], MAX_GROUP_FRAMES))
+    intervals = compared_intervals(timing, stacks.images.shape[1])
     motion = motion_of_fit(shrunk(fit, intervals), stacks.images.device)
     scale, doubtful = hypothesis.scale, hypothesis.is_doubtful
     if scale.same_for_all_columns:
@@ -280,9 +259,8 @@ def fit_directly(
             again = refine(frames, intervals, refined.fit, options.tones, has_pattern=hypothesis.has_pattern)
             refined = replace(again, abandoned=refined.abandoned)
     group_frames = [group.size for group in refined.frames.groups for _ in range(group.count)]
-    device = stacks.images.device
-    offsets, predicted = offset_curve(refined.measurements, refined.fit, refined.robust_weights, group_frames, device)
-    return Fitted(refined.fit, refined.measurements, offsets, predicted, refined)
+    curve = offset_curve(refined.measurements, refined.fit, refined.robust_weights, group_frames, stacks.images.device)
+    return Fitted(refined.fit, refined.measurements, *curve, refined)
 
 
 def _tones_of_bands(start: BandStart, timing: RowTiming, options: DetectionOptions, accuracy: float = 0.0) -> ToneFit:

@@ -26,6 +26,7 @@ from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
 from rsvib_torch.detection.rows.grouped_frames import GroupedFrames, MeasuredRows
 from rsvib_torch.detection.tones.fit import (
     ToneFit,
+    covariance_with_tones,
     fitted_again,
     is_bounded,
     model_displacements,
@@ -34,7 +35,6 @@ from rsvib_torch.detection.tones.fit import (
     residual_of,
     shrunk,
     strongest_only,
-    with_tone_parameters,
     with_tones,
 )
 from rsvib_torch.detection.tones.selection import (
@@ -63,9 +63,7 @@ class FittedRows:
     uneven: Array  # (B, 2) px, differences of the displacements along a row that roll and zoom cannot explain
     frames: GroupedFrames  # the frames; without a pattern of columns if there was one
     has_pattern: bool  # whether a pattern of columns was subtracted
-    # (B, A, P, R) changes of the parameters by the last R rounds, which count as errors; 0 for stacks that converged
-    unknown: Array
-    converged: Array  # (B,) bool, stacks whose next round would change little
+    unknown: Array  # (B, A P, A P) covariance of what the last rounds changed; 0 for stacks that converged
     abandoned: Array  # (B,) bool, stacks whose large residual ended the rounds early
 
 
@@ -78,10 +76,7 @@ def refine(
     may_abandon: bool = False,
     has_pattern: bool | None = None,
 ) -> FittedRows:
-    """Refine a motion, found in the offsets of row bands, on the images: the last measurements and the fit to them.
-
-    ``intervals`` (M,) are the times in s between the frames that are compared; other arguments as in ``Refinement``.
-    """
+    """Refine a motion of row bands on the images: the last measurements and the fit; arguments as in ``Refinement``."""
     # Rounds of measuring and fitting from the given start.
     refined = _rounds(frames, intervals, start, tones, may_abandon, has_pattern)
     # A long exposure can make the start choose the wrong side of a blind frequency: the other side is tried as well,
@@ -103,8 +98,7 @@ def refine(
     if tones is None:
         fit = significant_only(refined.measurements, refined.fit, intervals)
         if fit is not refined.fit:  # it was fitted again, without what the last rounds changed
-            covariance = fit.covariance + covariance_of_changes(refined.unknown)
-            refined = replace(refined, fit=replace(fit, covariance=covariance))
+            refined = replace(refined, fit=replace(fit, covariance=fit.covariance + refined.unknown))
     # The difference of the blur of the frames, by the final motion, contradicts a wrong exposure time.
     blur = table(refined.frames.blur_ratio(motion_of_fit(shrunk(refined.fit, intervals), device)))
     return replace(refined, other_motion=replace(refined.other_motion, blur=blur))
@@ -146,52 +140,28 @@ def _joined(finished: list["Refinement"], frames: GroupedFrames) -> FittedRows:
         frames = frames.without(pattern, stacks)
     if len(results) == 1:
         return replace(results[0], frames=frames)
-    count, rounds = _room(results)
     order = np.concatenate([refinement.stacks for refinement in finished]).argsort()
-    joined = take_stacks([_with_room(result, count, rounds) for result in results], order)
-    return replace(joined, frames=frames, has_pattern=bool(patterns))
+    return replace(_taken(results, order), frames=frames, has_pattern=bool(patterns))
 
 
-def _room(results: Sequence[FittedRows]) -> tuple[int, int]:
-    """Largest number of tones of an axis, and of rounds in ``unknown``."""
-    return max(one.fit.active.shape[-1] for one in results), max(one.unknown.shape[-1] for one in results)
-
-
-def _with_room(fitted: FittedRows, count: int, rounds: int) -> FittedRows:
-    """The same with room for ``count`` tones on each axis and the changes of ``rounds`` rounds."""
-    unknown = with_tone_parameters(fitted.unknown, 2, fitted.fit.active.shape[-1], count)
-    unknown = np.pad(unknown, ((0, 0), (0, 0), (0, 0), (0, rounds - unknown.shape[-1])))
-    return replace(fitted, fit=with_tones(fitted.fit, count), unknown=unknown)
+def _taken(results: Sequence[FittedRows], index: Array) -> FittedRows:
+    """``take_stacks`` of results with different numbers of tones."""
+    count = max(one.fit.active.shape[-1] for one in results)
+    roomy = [
+        replace(one, fit=with_tones(one.fit, count), unknown=covariance_with_tones(one.unknown, one.fit, count))
+        for one in results
+    ]
+    return take_stacks(roomy, index)
 
 
 class Refinement:
-    """State of the rounds that refine the motion of B stacks.
+    """State of the rounds that refine the motion of B stacks, from a fit to the offsets of row bands.
 
-    Args:
-        frames: The frames.
-        intervals: (M,) s, times between the frames that are compared.
-        start: Fit to the offsets of row bands.
-        tones: Number of tones of each axis; None to select it by significance.
-        may_abandon: Whether the motion is possibly of another kind than assumed (parallax instead of roll). Stacks with
-            a large residual after three rounds are then abandoned.
-        has_pattern: Whether the frames have a pattern of columns: it is then subtracted after the first round instead
-            of the last, or not looked for. None if it is not known.
-
-    Attributes:
-        frames: The frames, without a pattern of columns that was subtracted.
-        fit: The fit of the last round.
-        around: The fit around whose motion the next round measures.
-        warped_by: The fit around whose motion the last round measured.
-        round: Number of the next round, from 0, and of the rounds that have been made.
-        search_round: Round in which further tones are searched for. The first round removes the error of the band
-            offsets; weak tones are significant after it.
-        stacks: (B,) indices of the stacks in the batch.
-        pattern: (R, U) spectrum of the column pattern that was subtracted from the R rows of stacks or strips; None for
-            none.
-        ended: (B,) bool, stacks that no further round is permitted for, or would help.
-        settled: (B,) bool, other stacks that need no further round, unless a pattern of columns is the cause.
-        converged: (B,) bool, stacks whose next round would change little.
-        abandoned: (B,) bool, stacks that are abandoned.
+    ``intervals`` (M,) are the times in s between the frames that are compared; ``tones`` is the number of tones of each
+    axis, None to select it by significance. ``may_abandon``: whether the motion is possibly of another kind than
+    assumed (parallax instead of roll); stacks with a large residual after three rounds are then abandoned.
+    ``has_pattern``: whether the frames have a pattern of columns, which is then subtracted after the first round
+    instead of the last, or not looked for; None if it is not known.
     """
 
     def __init__(
@@ -204,10 +174,15 @@ class Refinement:
         may_abandon: bool = False,
         has_pattern: bool | None = None,
     ) -> None:
-        self.frames, self.fit = frames, start
+        self.frames, self.fit = frames, start  # without a pattern that was subtracted; the fit of the last round
+        # the fits around whose motions the next round measures and the last one measured
         self.around = self.warped_by = shrunk(start, intervals)
+        # the next round, and the one in which further tones are searched for: the first round removes the error of the
+        # band offsets, and weak tones are significant after it
         self.round, self.search_round = 0, 1
-        self.stacks = np.arange(len(start.centre))
+        self.stacks = np.arange(len(start.centre))  # (B,) indices in the batch
+        # (B,) bool: stacks that no further round is permitted for, or would help; others that need none, unless a
+        # pattern of columns is the cause; those whose next round would change little; those that are abandoned
         self.ended = self.settled = self.converged = self.abandoned = np.zeros_like(start.centre, dtype=bool)
         self._intervals, self._tones = intervals, tones
         self._may_abandon, self._has_pattern = may_abandon, has_pattern
@@ -219,7 +194,7 @@ class Refinement:
         self._acceleration = Acceleration()
         self._step: Step  # of the last round
         self._stalled: Array  # (B, A) bool, after the last round
-        self.pattern: Tensor | None = None
+        self.pattern: Tensor | None = None  # (R, U) spectrum that was subtracted from the R rows of stacks or strips
         # a strong pattern biases its first estimate, so that it is subtracted twice
         self._patterns_left = 0 if has_pattern is False else 2
         self._refused: Array | None = None  # (B, A) residuals before a pattern was subtracted, if all axes were refused
@@ -257,7 +232,8 @@ class Refinement:
         # 3. Stacks that no further round would help: those whose rows are not measured, those whose hypothesis leaves a
         # large residual, and those whose residual remains although a pattern of columns was subtracted because of it.
         if self._may_abandon and self.round == _TRIED_ROUNDS:
-            self.abandoned = _large_residual(self.frames, measured, self.fit)
+            other = conclude(self.frames, measured, self.fit).other_motion
+            self.abandoned = np.any(other.unexplained > _MAX_RESIDUAL * other.permitted, -1)
         self.ended = self.abandoned | ~(measurements.weights > 0).any((1, 2)) | (self.round == _MAX_ROUNDS)
         if self._refused is not None and self.round == self.search_round + 2:
             self.ended = self.ended | (size > 0.5 * self._refused).all(-1)
@@ -291,14 +267,11 @@ class Refinement:
         if self.round > 1:  # after the first round, the search is still to come
             self.search_round = self.round
             self._sizes = []
-            self._acceleration.clear()
+            self._acceleration = Acceleration()
         return True
 
     def accelerate(self) -> None:
-        """Continue with a faster step where the last one was too long or too short.
-
-        The gradients of the scene are used again if the motion changes little.
-        """
+        """Continue with a faster step where the last one was inexact, with the same gradients after a short step."""
         if self._gradients is None:  # it has just begun again
             return
         measurements = self._measured.measurements
@@ -318,11 +291,9 @@ class Refinement:
             return self
         index, part = np.flatnonzero(where), copy(self)
         part.frames, part._measured = self.frames.stacks(index), self._measured.stacks(index)
-        part.fit, part.around, part.warped_by = (
-            take_stacks([fit], index) for fit in (self.fit, self.around, self.warped_by)
-        )
+        for name in ("fit", "around", "warped_by", "_step"):
+            setattr(part, name, take_stacks([getattr(self, name)], index))
         part._fits = [take_stacks([fit], index) for fit in self._fits]
-        part._step = take_stacks([self._step], index)
         part._acceleration = Acceleration([take_stacks([step], index) for step in self._acceleration.steps])
         part._sizes = [size[index] for size in self._sizes]
         for name in ("stacks", "ended", "settled", "converged", "abandoned", "_stalled", "_refused"):
@@ -335,12 +306,32 @@ class Refinement:
         return part
 
     def result(self) -> FittedRows:
-        """The last measurements, with the exact fit to them."""
+        """The last measurements, with the exact fit to them.
+
+        If the rounds did not converge, what they changed is not known. The change of the displacements by the last one
+        counts as motion that is not explained, for all axes, because the displacement along one determines which rows
+        are compared along the other: tones of 10 to 40 px in three frames with a long exposure were wrong, with a
+        permitted residual. The changes of the parameters by the last rounds count as errors of unknown sign: tones near
+        blind frequencies with long exposures had errors of 4 to 18 standard deviations without them.
+        """
         fitted = conclude(self.frames, self._measured, self.fit)
-        converged = self.converged | self.abandoned
-        if not bool(converged.all()):
-            fitted = with_unknown_changes(fitted, self.warped_by, self.around, self._fits, ~converged)
-        return replace(fitted, has_pattern=self.pattern is not None, converged=self.converged, abandoned=self.abandoned)
+        fitted = replace(fitted, has_pattern=self.pattern is not None, abandoned=self.abandoned)
+        unknown = ~(self.converged | self.abandoned)
+        if not bool(unknown.any()):
+            return fitted
+        measurements, fit, other = fitted.measurements, fitted.fit, fitted.other_motion
+        change = Step.between(measurements, self.warped_by, self.around).change
+        distance = np.sqrt(without_nan(valid_mean(np.square(measurements.distances(change)), 1), 0.0))
+        least = (distance * unknown[:, None] / other.permitted).max(-1, keepdims=True) * other.permitted
+        changes = [(one.about(fit.centre).parameters - fit.parameters).reshape(len(unknown), -1) for one in self._fits]
+        columns = np.stack(changes, -1) * unknown[:, None, None]
+        covariance = columns @ columns.mT
+        return replace(
+            fitted,
+            other_motion=replace(other, unexplained=np.maximum(other.unexplained, least)),
+            fit=replace(fit, covariance=fit.covariance + covariance),
+            unknown=covariance,
+        )
 
     def _searched(self, measurements: Measurements, residual: Array) -> ToneFit:
         """Fit with further tones. The noise of rows is nearly white: a tone that explains 2 % is significant."""
@@ -362,13 +353,11 @@ class Refinement:
 
         A quarter in two rounds is too little to reach what is permitted in the rounds that remain.
         """
-        sizes = self._sizes
-        nothing = np.zeros_like(self.fit.active[..., 0])
-        if len(sizes) < 3:
-            return nothing
-        stalled = sizes[-1] > 0.75 * sizes[-3]
-        if not bool(stalled.any()):
-            return nothing
+        stalled = np.zeros_like(self.fit.active[..., 0])
+        if len(self._sizes) > 2:
+            stalled = self._sizes[-1] > 0.75 * self._sizes[-3]
+        if not stalled.any():
+            return stalled
         other = conclude(self.frames, measured, self.fit).other_motion
         return stalled & (other.unexplained > other.permitted)
 
@@ -378,15 +367,6 @@ class Refinement:
 _TRIED_ROUNDS, _MAX_RESIDUAL = 3, 2.0
 _MAX_ROUNDS = 12  # exposures of 400 rows need more than six
 _SAME_GRADIENTS = 0.05  # px; over smaller distances the gradients of the scene are the same
-
-
-def _large_residual(frames: GroupedFrames, measured: MeasuredRows, fit: ToneFit) -> Array:
-    """(B,) bool, whether the fit leaves a residual that no further round would reduce enough."""
-    other = conclude(frames, measured, fit).other_motion
-    return np.any(other.unexplained > _MAX_RESIDUAL * other.permitted, -1)
-
-
-# Conclusion
 
 
 def conclude(frames: GroupedFrames, measured: MeasuredRows, fit: ToneFit) -> FittedRows:
@@ -408,40 +388,9 @@ def conclude(frames: GroupedFrames, measured: MeasuredRows, fit: ToneFit) -> Fit
         uneven=measured.uneven(),
         frames=frames,
         has_pattern=False,
-        unknown=np.zeros((*fit.parameters.shape, 1)),
-        converged=np.zeros_like(fit.centre, dtype=bool),
+        unknown=np.zeros_like(fit.covariance),
         abandoned=np.zeros_like(fit.centre, dtype=bool),
     )
-
-
-def with_unknown_changes(
-    fitted: FittedRows, warped_by: ToneFit, around: ToneFit, fits: Sequence[ToneFit], where: Array
-) -> FittedRows:
-    """The fit of the stacks ``where`` (B,) whose rounds did not converge: what the last rounds changed is not known.
-
-    The change of the displacements by the last round, from the fit that the frames were ``warped_by`` to the one that a
-    further round would measure ``around``, counts as motion that is not explained, for all axes, because the
-    displacement along one determines which rows are compared along the other. Tones of 10 to 40 px in three frames with
-    a long exposure did not converge: they were wrong, with a permitted residual.
-
-    The changes of the parameters by the last rounds, of ``fits`` with the same tones, count as errors. Tones near blind
-    frequencies with long exposures had errors of 4 to 18 standard deviations without them.
-    """
-    measurements, fit, other = fitted.measurements, fitted.fit, fitted.other_motion
-    change = Step.between(measurements, warped_by, around).change
-    distance = np.sqrt(without_nan(valid_mean(np.square(measurements.distances(change)), 1), 0.0)) * where[:, None]
-    least = (distance / other.permitted).max(-1, keepdims=True) * other.permitted
-    other = replace(other, unexplained=np.maximum(other.unexplained, least))
-    changes = np.stack([one.about(fit.centre).parameters - fit.parameters for one in fits], -1)
-    unknown = changes * where[:, None, None, None]
-    fit = replace(fit, covariance=fit.covariance + covariance_of_changes(unknown))
-    return replace(fitted, other_motion=other, fit=fit, unknown=unknown)
-
-
-def covariance_of_changes(changes: Array) -> Array:
-    """Covariance (B, A P, A P) of parameters whose errors are the sum of changes (B, A, P, R) of unknown sign."""
-    columns = changes.reshape(len(changes), -1, changes.shape[-1])
-    return columns @ columns.mT
 
 
 # Mirrored frequencies
@@ -455,12 +404,10 @@ def mirrored_frequencies(measurements: Measurements, fit: ToneFit, start: ToneFi
     """Frequencies of the strongest tones, mirrored at the nearest blind frequency on the axis with the larger residual.
 
     With two frames a time T apart, tones equally far above and below a blind frequency ``j / T`` have the same gain and
-    differ only within a frame. The fit, refined from ``start``, may be at the wrong side; axes that were ``tried`` (B,
-    A) are not mirrored again.
-
-    Returns:
-        Frequencies (B, A, 1) in Hz and the axes (B, A) that are mirrored, at most one of each stack: those with a
-        residual of three standard deviations in the typical row, and frequencies that a frame does not resolve.
+    differ only within a frame. The fit, refined from ``start``, may be at the wrong side. The result has frequencies
+    (B, A, 1) in Hz and the axes (B, A) that are mirrored, at most one of each stack that was not ``tried`` (B, A):
+    those with a residual of three standard deviations in the typical row, and frequencies that a frame does not
+    resolve.
     """
     strongest = strongest_only(fit)
     residual = without_nan(median(measurements.sizes(residual_of(measurements, fit)), 1), 0.0)  # (B, A)
@@ -489,6 +436,4 @@ def with_better(first: FittedRows, second: FittedRows, index: Array) -> FittedRo
     better = sizes[1] < without_nan(sizes[0], np.inf)
     place = np.arange(len(first.unknown))
     place[index[better]] = len(place) + np.flatnonzero(better)
-    count, rounds = _room([first, second])
-    chosen = take_stacks([_with_room(first, count, rounds), _with_room(second, count, rounds)], place)
-    return replace(chosen, abandoned=first.abandoned)
+    return replace(_taken([first, second], place), abandoned=first.abandoned)

@@ -90,14 +90,13 @@ class AttitudeTones(
         camera = vibration.camera
         if camera is None:
             raise ValueError("the attitude requires a vibration with a camera")
-        focal_length = camera.focal_length
 
         def turned(values: Tensor, factors: tuple[float, float, float], without_roll: float) -> Tensor:
             x, y = values[..., 0, :], values[..., 1, :]
             roll = values[..., 2, :] if values.shape[-2] > 2 else torch.full_like(x, without_roll)
             return torch.stack([factors[0] * y, factors[1] * x, factors[2] * roll], -2)
 
-        lengths, ones = (1 / focal_length, 1 / focal_length, 1.0), (1.0, 1.0, 1.0)
+        lengths, ones = (1 / camera.focal_length, 1 / camera.focal_length, 1.0), (1.0, 1.0, 1.0)
         # yaw = -X / f and roll = -theta: the phase changes by pi
         opposite = vibration.phase.new_tensor([0.0, math.pi, math.pi])[:, None]
         phase = torch.remainder(turned(vibration.phase, ones, 0.0) + opposite + math.pi, 2 * math.pi) - math.pi
@@ -215,7 +214,8 @@ class DetectionResult(
         def of_findings(findings: tuple[Any, ...], depth: int) -> tuple[Any, ...]:
             return findings[:count] if depth == 0 else tuple(of_findings(part, depth - 1) for part in findings)
 
-        std, hidden = self.offsets.std, self.std_if_hidden_tone
+        curve, hidden = self.offsets, self.std_if_hidden_tone
+        std = None if curve.std is None else curve.std[..., :count]
         return replace(
             self,
             vibration=self.vibration.mapped(first),
@@ -225,11 +225,7 @@ class DetectionResult(
             residual=first(self.residual),
             reliable=first(self.reliable),
             findings=of_findings(self.findings, batch),
-            offsets=replace(
-                self.offsets,
-                offsets=self.offsets.offsets[..., :count],
-                std=None if std is None else std[..., :count],
-            ),
+            offsets=replace(curve, offsets=curve.offsets[..., :count], std=std),
             fitted=self.fitted[..., :count],
             sensitivity=self.sensitivity.mapped(first),
         )

@@ -52,7 +52,9 @@ def timing_sensitivity(fit: ToneFit, timing: RowTiming, num_frames: int, num_row
     largest_first = (-fit.amplitude).argsort(-1, stable=True)
     size = np.where(fit.amplitude > 1e-9, fit.amplitude, 1.0)  # px or rad; a tone that has decayed does not count
     for name in ("row_time", "frame_rows", "exposure_rows"):
-        lower, higher = (model_displacements(record(_scaled(timing, name, 1 + sign * _STEP)), fit) for sign in (-1, 1))
+        stated = getattr(timing, name)
+        timings = [replace(timing, **{name: stated * (1 + sign * _STEP)}) for sign in (-1, 1)]
+        lower, higher = (model_displacements(record(one), fit) for one in timings)
         change = (higher - lower) / (2 * _STEP)
         moved = -inverses @ np.moveaxis(change, -1, 1).reshape(batch, axes, -1, 1)
         by_tones = split_axis(moved[:, :, : 3 * tones, 0], -1, tones, 3)
@@ -77,8 +79,8 @@ def with_row_time_std(
         torch.stack([getattr(sensitivity, f"{of}_by_{time}") for of in ("amplitude", "frequency", "phase")])
         for time in ("row_time", "frame_rows", "exposure_rows")
     )
-    change = (by_row_time - by_frame_rows - by_exposure_rows) * (timing.row_time_std / timing.row_time)
-    amplitude, frequency, phase = change
+    relative = timing.row_time_std / timing.row_time
+    amplitude, frequency, phase = (by_row_time - by_frame_rows - by_exposure_rows) * relative
     return replace(
         std,
         amplitude=torch.hypot(std.amplitude, vibration.amplitude * amplitude),
@@ -89,20 +91,12 @@ def with_row_time_std(
 
 
 def displacements_by_row_time(measured: Measurements, motion: Motion, timing: RowTiming, num_frames: int) -> Array:
-    """Change (1, N, G, A) in px of the displacements by a motion if the row time is wrong by its standard deviation.
-
-    The motion is not a batch and on the CPU. Rows are then exposed at other times after the starts of their frames.
-    """
+    """Change (1, N, G, A) in px of the displacements by a motion (no batch) for a row time wrong by its deviation."""
     times, starts = measured.exposure_starts, table(timing.frame_starts(num_frames))
     frames = np.searchsorted(starts, times + 0.5 * timing.row_time, "right") - 1
     later = times + (timing.row_time_std / timing.row_time) * (times - starts[np.maximum(frames, 0)])
     moved = [table(motion.mean_displacement(tensor(at), measured.exposure_time)) for at in (times, later)]
     return measured.relative(moved[1] - moved[0])
-
-
-def _scaled(timing: RowTiming, name: str, factor: float) -> RowTiming:
-    """The timing with one of its times multiplied by a factor."""
-    return replace(timing, **{name: getattr(timing, name) * factor})
 
 
 def assumptions(
@@ -113,10 +107,7 @@ def assumptions(
     num_rows: int,
     blur: Array | None = None,
 ) -> tuple[tuple[str, ...], ...]:
-    """What the frames cannot contradict, with its effect on vibrations (B) in image axes, one sentence for each.
-
-    ``blur`` (B, 3) as in ``OtherMotion``; None if it was not measured.
-    """
+    """What frames cannot contradict, with its effect on vibrations (B) in image axes; ``blur`` of ``OtherMotion``."""
     # 1. Sentences about all stacks.
     sentences, times = [], ["exposure_rows"]
     if timing.frame_start_times is None:
@@ -139,7 +130,7 @@ def assumptions(
             f"{what}, readout direction, scan axis and order of the frames: two frames cannot contradict them, more "
             "frames can"
         )
-        times.insert(0, "frame_rows" if timing.frame_start_times is None else "row_time")
+        times.insert(0, what.partition(",")[0])
     # 2. Effects on the tones of each stack.
     amplitudes, frequencies = tables(vibration.amplitude, vibration.frequency)
     changes = {name: tables(*(getattr(sensitivity, f"{of}_by_{name}") for of in _CHANGED)) for name in times}
@@ -158,10 +149,7 @@ _Tones = list[tuple[int, int, float]]  # axis, number and frequency in Hz of eac
 
 
 def _effects(name: str, tones: _Tones, changes: list[Array], timing: RowTiming) -> list[str]:
-    """Sentence about the effect of an error of 1 % of a stated time on every tone; none if all are below 0.1 %.
-
-    ``changes`` (A, K) are the sensitivities of the quantities ``_CHANGED`` to that time.
-    """
+    """Sentence about the effect of an error of 1 % of a stated time on every tone; none if all are below 0.1 %."""
     of_tones = []
     for axis, tone, frequency in tones:
         of_tone = zip(_CHANGED, (change[axis, tone] for change in changes), strict=True)

@@ -86,33 +86,25 @@ class DisplacementSpectrum(
 
     def summary(self) -> str:
         """The lines of each axis above 1 % of its strongest one, and the median noise outside blind bands."""
-        amplitude = self.lines.amplitude
+        amplitude, frequency = self.lines.amplitude, self.lines.frequency
         rows = [
-            [
-                AXIS_NAMES[axis],
-                measured_text(self.lines.amplitude[axis, line]),
-                measured_text(self.lines.frequency[axis, line]),
-            ]
+            [AXIS_NAMES[axis], measured_text(amplitude[axis, line]), measured_text(frequency[axis, line])]
             for axis, line in (amplitude > SMALLEST_SHOWN * amplitude.amax(-1, keepdim=True)).nonzero().tolist()
         ]
         noise = ", ".join(
             f"{name} {measured_text(values[~self.blind].nanmedian(), digits=2)}"
             for name, values in zip(AXIS_NAMES, self.noise, strict=False)
         )
-        limits = (
-            f"{float(self.frequency[0]):.4g} … {float(self.frequency[-1]):.5g} Hz, resolution {self.resolution:.3g} Hz"
-        )
-        return "\n".join(
-            [limits, text_table(["axis", "line (px)", "frequency (Hz)"], rows), f"noise (px rms): {noise}"]
-        )
+        first, last = float(self.frequency[0]), float(self.frequency[-1])
+        limits = f"{first:.4g} … {last:.5g} Hz, resolution {self.resolution:.3g} Hz"
+        lines = text_table(["axis", "line (px)", "frequency (Hz)"], rows)
+        return "\n".join([limits, lines, f"noise (px rms): {noise}"])
 
     def table(self, *, pixel_size: float | None = None) -> dict[str, list[Any]]:
         """One row per frequency; arguments as in ``Result.table``."""
         pixel_size = check_pixel_size(pixel_size)
         columns = {"frequency_Hz": self.frequency, "blind": self.blind}
-        for axis, (name, unit) in enumerate(zip(AXIS_NAMES, _UNITS, strict=True)):
-            if axis >= len(self.amplitude):
-                break
+        for axis, name, unit in zip(range(len(self.amplitude)), AXIS_NAMES, _UNITS, strict=False):
             columns |= {
                 f"amplitude_{name}_{unit}": self.amplitude[axis],
                 f"noise_{name}_{unit}": self.noise[axis],
@@ -134,10 +126,7 @@ class DisplacementSpectrum(
 def displacement_spectrum(
     curve: OffsetCurve, timing: SensorTiming, vibration: Vibration, fitted: Tensor
 ) -> DisplacementSpectrum:
-    """The spectrum of the displacement from the offsets of one stack, at least 8.
-
-    Lines of the ``vibration`` are known; ``fitted`` (P, N, A) are the offsets by its tones and the image motion.
-    """
+    """The spectrum of the displacement from offsets of one stack, ``fitted`` (P, N, A) by a known vibration."""
     check_single("result", curve)
     good = curve.good & (curve.quality > 0)
     if curve.std is not None:
@@ -229,11 +218,9 @@ class _Offsets:
                 lines = refined
         complex_amplitude = sums / (0.5 * np.where(visible, attenuation, np.inf) * energy)
         lines = np.concatenate([known, lines])
-        for at, line in lines:
-            # the width of a line is chosen so that the integral of its PSD is half of its squared amplitude
-            complex_amplitude = complex_amplitude + line * np.exp(
-                -0.5 * np.pi * np.square((frequency - at.real) * span)
-            )
+        # the width of a line is chosen so that the integral of its PSD is half of its squared amplitude
+        places, sizes = (frequency - lines[:, :1].real) * span, lines[:, 1:]
+        complex_amplitude = complex_amplitude + (sizes * np.exp(-0.5 * np.pi * np.square(places))).sum(0)
         noise = 2 * np.sqrt(level / energy) / np.maximum(np.abs(attenuation), 1e-12)
         return np.abs(complex_amplitude), noise, lines, response
 
@@ -261,8 +248,7 @@ class _Offsets:
         scale = np.maximum(scale, 1e-300)
         scaled = root * design / scale
         normal, right = scaled.T @ scaled, scaled.T @ (root[:, 0] * self.values)
-        solution: Array = np.linalg.lstsq(normal, right, rcond=1e-7)[0] / scale
-        return solution
+        return np.linalg.lstsq(normal, right, rcond=1e-7)[0] / scale
 
     def _refined(self, lines: Array, span: float) -> Array:
         """Lines after three Gauss-Newton steps of all amplitudes and frequencies; the first sets new amplitudes."""
@@ -277,8 +263,7 @@ class _Offsets:
         """Offsets (N,) without the lines and the drift."""
         design = self._design(lines)
         kept = np.r_[: 2 * len(lines), 3 * len(lines) : design.shape[1]]
-        rest: Array = self.values - design[:, kept] @ self._solved(design[:, kept], len(lines))
-        return rest
+        return self.values - design[:, kept] @ self._solved(design[:, kept], len(lines))
 
 
 def _lines_of(vibration: Vibration, axis: int, centre: float) -> Array:

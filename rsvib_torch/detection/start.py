@@ -11,8 +11,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.strips import FieldScale, combined_strips, cut_into_strips
+from rsvib_torch.detection.strips import FieldScale, combined_strips
 from rsvib_torch.detection.tones.fit import ToneFit, model_displacements, with_axes
+from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.frames.pixels import cut_columns, detailed_parts
 from rsvib_torch.motion.timing import RowTiming
@@ -25,12 +26,7 @@ _START_COLUMNS = 320  # px, columns that give a start of sufficient accuracy
 
 
 def band_curve(
-    frames: Tensor,
-    valid: Tensor | None,
-    timing: RowTiming,
-    options: RegistrationOptions,
-    *,
-    mere_start: bool,
+    frames: Tensor, valid: Tensor | None, timing: RowTiming, options: RegistrationOptions, *, mere_start: bool
 ) -> OffsetCurve:
     """Offsets of the row bands of grey frames (B, T, H, W), NaN for bands with more than half of their pixels missing.
 
@@ -71,12 +67,7 @@ class BandStart:
 
 
 def band_start(
-    stacks: GreyFrames,
-    timing: RowTiming,
-    options: RegistrationOptions,
-    *,
-    mere_start: bool,
-    known: OffsetCurve | None = None,
+    stacks: GreyFrames, timing: RowTiming, options: RegistrationOptions, known: OffsetCurve | None, *, mere_start: bool
 ) -> BandStart:
     """``band_curve`` with its measurements; ``known`` are the offsets of these frames with another timing."""
     if known is None:
@@ -99,39 +90,30 @@ def strips_fit(num_rows: int, width: int, options: RegistrationOptions) -> bool:
 
 
 def field_start(
-    stacks: GreyFrames,
-    timing: RowTiming,
-    options: RegistrationOptions,
-    scale: FieldScale,
-    translation: ToneFit | None,
+    stacks: GreyFrames, timing: RowTiming, options: RegistrationOptions, scale: FieldScale, translation: ToneFit | None
 ) -> BandStart:
     """Offsets of row bands for a motion with roll or zoom, from two to four parts of the columns.
 
     Bands of parts of the width are often registered wrongly. The tones of x and y are therefore taken from the
-    ``translation``, a fit without roll and zoom, which has smaller errors.
-
-    Raises:
-        ValueError: If the parts are too narrow, see ``strips_fit``.
+    ``translation``, a fit without roll and zoom, which has smaller errors. Parts that are too narrow are an error.
     """
-    frames, valid = stacks.images, stacks.valid
-    count = _num_strips(frames.shape[-1])
-    parts, columns = cut_into_strips(frames, count)
-    valid_parts = None if valid is None else cut_into_strips(valid, count)[0]
-    of_strips = band_curve(parts, valid_parts, timing, options, mere_start=False)
+    frames, valid, width = stacks.images, stacks.valid, stacks.images.shape[-1]
+    count = _num_strips(width)
+    part = round(width / count)  # px
+    firsts = tuple(round(number * (width - part) / (count - 1)) for number in range(count))
+    strips = ColumnStrips(width, part, firsts, tuple(first + 0.5 * (part - 1) for first in firsts))
+    cut_valid = None if valid is None else strips.cut(valid)
+    of_strips = band_curve(strips.cut(frames), cut_valid, timing, options, mere_start=False)
+    columns = strips.columns.to(frames.device)
     rows = (of_strips.rows - 0.5 * (scale.height - 1)).repeat(len(of_strips.pairs))
     factors = scale.factors(columns[:, None].expand(-1, len(rows)), rows.expand(count, -1))
     of_parts = measurements_of_curve(of_strips, timing, options.band_step)
     measurements = combined_strips(of_parts, np.repeat(table(factors)[None], len(frames), 0))
-    shape = of_strips.quality.shape[1:]
-    good = np.all(measurements.weights > 0, -1)
-    offsets = measurements.displacements[:, :, 1] - measurements.displacements[:, :, 0]
-    offsets = np.where(good[..., None], offsets, np.nan)
-    quality = of_strips.quality.unflatten(0, (-1, count)).amin(1)
-    curve = replace(
-        of_strips,
-        offsets=torch.from_numpy(split_axis(offsets, 1, *shape)).to(frames.device),
-        quality=quality * torch.from_numpy(split_axis(good, 1, *shape)).to(frames.device),
-    )
+    good = np.all(measurements.weights > 0, -1)[..., None]
+    offsets = np.where(good, measurements.displacements[:, :, 1] - measurements.displacements[:, :, 0], np.nan)
+    offsets, good = (split_axis(values, 1, *of_strips.quality.shape[1:]) for values in (offsets, good))
+    quality = of_strips.quality.unflatten(0, (-1, count)).amin(1) * torch.from_numpy(good[..., 0]).to(frames.device)
+    curve = replace(of_strips, offsets=torch.from_numpy(offsets).to(frames.device), quality=quality)
     return BandStart(curve, measurements, None if translation is None else with_axes(translation, scale.axes))
 
 
@@ -150,11 +132,12 @@ def measurements_of_curve(curve: OffsetCurve, timing: RowTiming, band_step: int)
     weight = weight / np.maximum(weight.sum(1, keepdims=True) / np.maximum(good.sum(1, keepdims=True), 1), 1e-300)
     offsets = np.where(good[..., None], offsets, 0.0)
     # 2. Their times: content that moves by y along the scan axis is exposed y row times later in the later frame.
-    return Measurements.of_pairs(
-        starts=np.broadcast_to(times.ravel(), good.shape),
-        later_starts=later_times.ravel() + offsets[..., 1] * timing.row_time,
-        offsets=offsets,
-        information=weight[..., None, None] * np.eye(2),
+    starts = np.broadcast_to(times.ravel(), good.shape), later_times.ravel() + offsets[..., 1] * timing.row_time
+    return Measurements(
+        np.stack(starts, -1),
+        np.stack([-0.5 * offsets, 0.5 * offsets], -2),
+        visible=np.ones((*good.shape, 2)),
+        information=2.0 * weight[..., None, None] * np.eye(2),  # of each of the two, equal and opposite
         exposure_time=timing.exposure_time,
         average_times=(curve.heights[0] * timing.row_time, curve.heights[1] * timing.row_time),
         independent=min(1.0, band_step / max(curve.heights)),

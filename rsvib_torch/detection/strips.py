@@ -15,7 +15,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements
@@ -64,28 +63,18 @@ class FieldScale:
 
     def std(self, fitted: VibrationStd) -> VibrationStd:
         """The same for standard deviations."""
-        if self.same_for_all_columns:
-            return fitted
         factor = self.units(fitted.amplitude)
-        return replace(
-            fitted,
-            amplitude=fitted.amplitude * factor[:, None],
-            image_motion=fitted.image_motion * factor,
-            image_acceleration=fitted.image_acceleration * factor,
-            displacement=None if fitted.displacement is None else fitted.displacement * factor,
-        )
+        of_axes = ("image_motion", "image_acceleration", "displacement")
+        values = {name: getattr(fitted, name) for name in of_axes}
+        scaled = {name: value * factor for name, value in values.items() if value is not None}
+        return replace(fitted, amplitude=fitted.amplitude * factor[:, None], **scaled)
 
     def factors(self, x: Tensor, y: Tensor) -> Tensor:
         """Displacement (S, 2, A) at positions (S) in px from the centre by unit components in px."""
-        factors: Tensor = displacement_factors(x, y, self.axes, self.camera) * self.units(x)
-        return factors
+        return displacement_factors(x, y, self.axes, self.camera) * self.units(x)
 
 
-def camera_in_row_order(
-    options: ProjectionOptions,
-    size: tuple[int, int],
-    timing: SensorTiming,
-) -> Camera | None:
+def camera_in_row_order(options: ProjectionOptions, size: tuple[int, int], timing: SensorTiming) -> Camera | None:
     """Camera of frames of ``size`` (rows, columns) in row order, from the options of ``detect_vibration``."""
     principal_point, distortion = options.principal_point, options.distortion
     if options.focal_length is None:
@@ -104,10 +93,7 @@ def camera_in_row_order(
 
 
 def combined_strips(measured: Measurements, factors: Array) -> Measurements:
-    """Components (B, N, G, A) of the motion of every row from the displacements (B S, N, G, 2) of strips.
-
-    ``factors`` (B, S, N, 2, A) are displacements by unit components.
-    """
+    """Components (B, N, G, A) of rows from displacements (B S, N, G, 2) of strips by ``factors`` (B, S, N, 2, A)."""
     strips = factors.shape[1]
 
     def of_strips(values: Array) -> Array:
@@ -139,13 +125,3 @@ def combined_strips(measured: Measurements, factors: Array) -> Measurements:
         measured.average_times,
         measured.independent,
     )
-
-
-def cut_into_strips(values: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Images (B, T, H, W) in ``count`` strips of columns (B S, T, H, w), and the middles (S,) of the strips."""
-    width = values.shape[-1]
-    columns = round(width / count)
-    firsts = [round(number * (width - columns) / max(1, count - 1)) for number in range(count)]
-    strips = torch.stack([values[..., first : first + columns] for first in firsts], 1).flatten(0, 1)
-    middles = torch.tensor(firsts, dtype=torch.float64, device=values.device) + 0.5 * (columns - width)
-    return strips, middles

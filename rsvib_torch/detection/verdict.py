@@ -5,7 +5,7 @@
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -30,19 +30,10 @@ _MIN_MOTION = 0.05  # px between frames; offsets of bands have errors of this si
 _OF_STACK = ("measured", "bands", "differential", "blur")  # quantities without an entry for each axis
 
 
-@dataclass(frozen=True, eq=False)
-class BandOffsets:
-    """Offsets of M row bands of B stacks."""
-
-    offsets: Array  # (B, M, A) px, NaN where a band could not be registered
-    fitted: Array  # (B, M, A) px, offsets predicted by the vibration
-    visible: Array  # (B, M) bool, bands that both frames contain
-
-
 def judged(
     vibration: Vibration,
     std: VibrationStd,
-    measured: OtherMotion | BandOffsets,
+    measured: OtherMotion | dict[str, Array],
     *,
     intervals: Array,
     displacement: Array,
@@ -53,12 +44,11 @@ def judged(
 ) -> tuple[Findings, ...]:
     """Reasons against the vibrations of B stacks, for each of their A axes in row order.
 
-    ``measured`` is the motion of the rows that they do not explain, or the offsets of row bands. ``intervals`` in s are
-    those between the frames of the largest groups; fast motion and unequal blur permit smaller ones. ``displacement``
-    and ``known_std`` (B, A) in px are the displacement of the rows by the tones without its mean, rms over the rows,
-    and its standard deviation if the number of tones is right. An axis with ``max_tones``, the largest number that was
-    tried, may have more. ``radius`` is the distance from the centre, in px, at which roll and zoom are displacements in
-    px.
+    ``measured`` is the motion of the rows that they do not explain, or ``compared_bands``. ``intervals`` in s are
+    those between the frames of the largest groups. ``displacement`` and ``known_std`` (B, A) in px are the displacement
+    of the rows by the tones without its mean, rms over the rows, and its standard deviation if the number of tones is
+    right. An axis with ``max_tones``, the largest number that was tried, may have more. ``radius`` is the distance from
+    the centre, in px, at which roll and zoom are displacements in px.
     """
     # 1. The compared quantities of all stacks and axes.
     frequency = table(vibration.frequency)
@@ -78,37 +68,39 @@ def judged(
         # Condition (24) concerns the tones only: the blur by a uniform motion is exact at any speed.
         tones = Vibration(vibration.amplitude, vibration.frequency, vibration.phase)
         within = tones.displacement_within(timing.row_time)
-        quantities |= {**_compared_bands(measured), "within_row_time": table(within)}
+        quantities |= measured | {"within_row_time": table(within)}
 
     # 2. The comparisons with the limits.
-    findings = []
+    findings, least_gain = [], _MIN_GAIN_OF_TWO if intervals.size == 1 else MIN_GAIN
     for numbers in zip(*(values.tolist() for values in quantities.values()), strict=True):
         stack = dict(zip(quantities, numbers, strict=True))
-        least_gain = _MIN_GAIN_OF_TWO if intervals.size == 1 else MIN_GAIN
         against = _reasons_against_stack(stack, timing, max_tones, least_gain)
         # A displacement by roll or zoom depends on the distance from the centre.
-        for axis, reasons in enumerate(against):
-            if axis >= 2:
-                reasons[:] = [
-                    replace(one, details={**one.details, "radius": radius}) if one.kind.unit == "px" else one
-                    for one in reasons
-                ]
+        for reasons in against[2:]:
+            reasons[:] = [
+                replace(one, details={**one.details, "radius": radius}) if one.kind.unit == "px" else one
+                for one in reasons
+            ]
         findings.append(tuple(map(tuple, against)))
     return tuple(findings)
 
 
-def _compared_bands(bands: BandOffsets) -> dict[str, Array]:
-    """Fraction of the visible bands that were registered, and size and residual of the best three quarters of them."""
-    good = np.isfinite(bands.offsets).all(-1) & bands.visible
+def compared_bands(offsets: Array, fitted: Array, visible: Array) -> dict[str, Array]:
+    """Fraction of the visible bands that were registered, and size and residual of the best three quarters of them.
+
+    Offsets (B, M, A) in px are NaN where a band could not be registered; the vibration predicts those that are
+    ``fitted``, and both frames contain the ``visible`` (B, M) bands.
+    """
+    good = np.isfinite(offsets).all(-1) & visible
     number = good.sum(1, keepdims=True)
-    offsets = np.where(good[..., None], bands.offsets, np.nan)
+    offsets = np.where(good[..., None], offsets, np.nan)
     # Clouds may cover the other quarter.
-    residuals = np.sort(without_nan(np.abs(offsets - bands.fitted), math.inf), 1)
+    residuals = np.sort(without_nan(np.abs(offsets - fitted), math.inf), 1)
     counted = np.ceil(0.75 * number)
     best = np.arange(residuals.shape[1])[:, None] < counted[:, None]
     return {
-        "measured": number[:, 0] / np.maximum(bands.visible.sum(1), 1),
-        "bands": bands.visible.sum(1),
+        "measured": number[:, 0] / np.maximum(visible.sum(1), 1),
+        "bands": visible.sum(1),
         "residual": np.where(best, residuals, 0.0).sum(1) / counted,
         "size": valid_mean(np.abs(offsets - valid_mean(offsets, 1)[:, None]), 1),
     }
@@ -116,8 +108,10 @@ def _compared_bands(bands: BandOffsets) -> dict[str, Array]:
 
 def _reasons_against_stack(stack: Table, timing: RowTiming, max_tones: float, least_gain: float) -> list[list[Reason]]:
     """Reasons against each axis of one stack, from the numbers of its compared quantities."""
-    by_rows, axes = "bands" not in stack, len(stack["amplitude"])
-    of_all = _measurement_reasons(stack)
+    by_rows, axes, of_all = "bands" not in stack, len(stack["amplitude"]), []
+    if stack["measured"] < _MIN_MEASURED:
+        what = "the rows" if by_rows else f"{stack['bands']:g} row bands"
+        of_all = [Reason("rows_not_registered", None, stack["measured"], _MIN_MEASURED, {"what": what})]
     if by_rows:
         of_all += _exposure_reasons(timing, *stack["blur"])
     against = []
@@ -163,14 +157,6 @@ def with_reasons_of_all(of_all: list[Reason], findings: Findings) -> Findings:
     )
 
 
-def _measurement_reasons(stack: Table) -> list[Reason]:
-    """Reasons from the fraction of the visible rows or bands that were measured."""
-    if stack["measured"] >= _MIN_MEASURED:
-        return []
-    what = f"{stack['bands']:g} row bands" if "bands" in stack else "the rows"
-    return [Reason("rows_not_registered", None, stack["measured"], _MIN_MEASURED, {"what": what})]
-
-
 # Offset gain of a tone in two frames. A tone with a smaller one and an image motion may explain the rows as well as a
 # tone of another frequency: of 59 reliable axes with gains of 0.1 to 0.3, 30 had displacements that were wrong by more
 # than 5 %, one by more than its size; of 79 in four frames 8, none by more than 15 %. Of 301 axes with random tones,
@@ -187,11 +173,10 @@ def _tone_reasons(
     turns = math.pi * hertz * timing.exposure_time
     offset = size * gain * abs(math.sin(turns) / turns if turns else 1.0)
     details: dict[str, float | str] = {"frequency": hertz}
-    reasons = []
+    reasons, needed = [], MIN_SIGNIFICANCE * size_std
     if not (0 < size_std < math.inf and 0 < hertz_std < math.inf):
         reasons.append(Reason("tone_uncertainty_unknown", axis, details=details))
-    elif size < MIN_SIGNIFICANCE * size_std and num_tones == 1:
-        needed = MIN_SIGNIFICANCE * size_std
+    elif num_tones == 1 and size < needed:
         reasons.append(Reason("tone_not_significant", axis, size, needed, details | {"std": size_std}))
     elif offset < MIN_OFFSET:
         reasons.append(Reason("tone_too_small", axis, offset, MIN_OFFSET, details))
@@ -215,11 +200,11 @@ def _displacement_reasons(axis: str, numbers: Table, num_tones: int) -> list[Rea
     are listed in docs/verdicts.md; of 18 simulated axes with several tones above 4 %, 3 were known within 2 %.
     """
     size, std, known_std = numbers["displacement"], numbers["std"], numbers["known_std"]
-    allowed = max(0.04 * size, 0.01)  # px
+    allowed, largest = max(0.04 * size, 0.01), MAX_DISPLACEMENT_STD * size  # px
     if num_tones and std > allowed and (num_tones > 1 or std > 1.5 * known_std):
         return [Reason("displacement_ambiguous", axis, std, allowed, {"size": size})]
-    if num_tones and std > MAX_DISPLACEMENT_STD * size:
-        return [Reason("displacement_uncertain", axis, std, MAX_DISPLACEMENT_STD * size, {"size": size})]
+    if num_tones and std > largest:
+        return [Reason("displacement_uncertain", axis, std, largest, {"size": size})]
     return []
 
 
@@ -236,10 +221,7 @@ def _band_reasons(axis: str, numbers: Table) -> list[Reason]:
 
 
 def residual_reasons(axis: str, numbers: Table) -> list[Reason]:
-    """Reasons from motion of the rows along an axis that no vibration explains; ``numbers`` of ``OtherMotion`` in px.
-
-    docs/verdicts.md lists the limits; they exceed the errors of interpolation and of the correction for unequal blur.
-    """
+    """Reasons from motion of rows in px that no vibration explains; limits exceed errors of interpolation and blur."""
     if numbers["unexplained"] > numbers["permitted"]:
         return [Reason("rows_unexplained", axis, numbers["unexplained"], numbers["permitted"])]
     allowed = max(0.01, 0.0025 * numbers["size"])  # px
@@ -256,11 +238,10 @@ def with_remedy(reasons: Iterable[Reason], remedy: str) -> tuple[Reason, ...]:
     )
 
 
-def contradicted_axes(findings: Findings) -> tuple[bool, bool]:
-    """Whether the measured rows contradict the tones of each axis, so that another timing may be the cause."""
+def contradicted_axes(findings: Findings) -> list[bool]:
+    """Whether the measured rows contradict the tones of x and y, so that another timing may be the cause."""
     codes = {"too_many_tones", "rows_unexplained", "neighbours_unexplained"}
-    first, second = (any(reason.code in codes for reason in of_axis) for of_axis in findings[:2])
-    return first, second
+    return [any(reason.code in codes for reason in of_axis) for of_axis in findings[:2]]
 
 
 # Roll and zoom
@@ -308,11 +289,8 @@ def rotation_reasons(axis: int, axes: int, differential: Sequence[float], size: 
     and ``size`` px the rms offset along the axis.
     """
     apart, allowed = max(differential) if axes > 2 else differential[1 - axis], float(_max_apart(size))
-    if not apart > allowed:  # nothing was measured: NaN
-        return []
-    if axes > 2:
-        return [Reason("strips_apart", AXIS_NAMES[axis], apart, allowed)]
-    return [Reason("halves_apart", AXIS_NAMES[axis], apart, allowed)]
+    code = "strips_apart" if axes > 2 else "halves_apart"
+    return [Reason(code, AXIS_NAMES[axis], apart, allowed)] if apart > allowed else []  # not if it is NaN
 
 
 # Exposure
@@ -345,10 +323,7 @@ def _exposure_reasons(timing: RowTiming, ratio: float, std: float, size: float) 
 
 
 def recording_reasons(moved: Sequence[float], unexplained: Sequence[float], other: float | None) -> list[Reason]:
-    """Reasons against a recorded motion, from the rms motion of the rows by it and beside it along each axis, in px.
-
-    ``other`` is another offset of its clock in s that explains the frames as well.
-    """
+    """Reasons against a recorded motion, from rms motion in px by it and beside it, and another clock offset in s."""
     reasons, largest = [], max(moved)
     if largest < _MIN_MOTION:
         reasons.append(Reason("recorded_motion_too_small", None, largest, _MIN_MOTION))

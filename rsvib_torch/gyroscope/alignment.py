@@ -17,7 +17,7 @@ from rsvib_torch.checks.validation import Extensible, Number
 from rsvib_torch.checks.validation import options as option_group
 from rsvib_torch.checks.values import check_single
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
+from rsvib_torch.detection.rows.grouped_frames import grouped_frames
 from rsvib_torch.detection.shapes.free import residual_of_motion, rms_motion, start_curve
 from rsvib_torch.detection.start import measurements_of_curve
 from rsvib_torch.detection.verdict import recording_reasons
@@ -271,11 +271,10 @@ def align_motion(
     clock, _ = fit_clock(measured, turned, clock, False, options.fit_gain)
     weighed = measured.reweighted(residual_of_motion(measured, clock.motion(turned)))
     clock, covariance = fit_clock(weighed, turned, clock, options.fit_scale, options.fit_gain)
-    groups = frame_groups(stack_spectra(grey, stack.valid), rowwise, clock.motion(turned).expanded(1).to(grey.device))
+    rows = grouped_frames(grey, stack.valid, rowwise, clock.motion(turned).expanded(1).to(grey.device))
     for _ in range(3):
-        measured, _ = measure_groups(
-            groups, rowwise, clock.motion(turned).expanded(1).to(grey.device), keep_images=False
-        )
+        moved = clock.motion(turned).expanded(1).to(grey.device)
+        measured = rows.measure(moved, keep_images=False).measurements
         weighed = measured.reweighted(residual_of_motion(measured, clock.motion(turned)))
         clock, covariance = fit_clock(weighed, turned, clock, options.fit_scale, options.fit_gain)
     aligned = clock.motion(turned)

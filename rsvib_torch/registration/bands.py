@@ -57,10 +57,7 @@ class BandTask:
 
 
 def take_windows(images: Tensor, tops: Tensor, lefts: Tensor, height: int, width: int) -> Tensor:
-    """Windows (L, N, height, width) of images (L, H, W) from rows ``tops`` and columns ``lefts`` (L, N) int64 on.
-
-    Rows beyond the edge repeat the edge row; columns are clamped to the image.
-    """
+    """Windows (L, N, height, width) of images (L, H, W) at rows and columns (L, N); beyond the edge, rows repeat."""
     batch, num_rows, num_columns = images.shape
     rows = (tops[..., None] + torch.arange(height, device=images.device)).clamp(0, num_rows - 1)
     lefts = lefts.clamp(0, num_columns - width)
@@ -93,7 +90,7 @@ def _at_edge(place: Tensor, surface: Tensor) -> Tensor:
 def whole_pixel_peak(surface: Tensor, factor: int) -> tuple[Tensor, Tensor]:
     """Whole-pixel lags (L, N, 2) in (x, y) of the peaks of surfaces (L, N, A, B), and whether they are inside (L, N).
 
-    The columns of the surfaces count ``factor`` pixels each; a parabola through three columns gives the single pixel.
+    The columns count ``factor`` pixels each; a parabola through three columns gives the single pixel.
     """
     flat = surface.flatten(0, 1)
     place, value = integer_peak(flat)
@@ -107,11 +104,7 @@ def whole_pixel_peak(surface: Tensor, factor: int) -> tuple[Tensor, Tensor]:
 
 
 def fine_offsets(task: BandTask, shift: Tensor, surface: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-    """Offsets (L, N, 2) and quality (L, N) from correlation surfaces at the lags around whole-pixel shifts.
-
-    The ``shift`` (L, N, 2) in px is the centre of each ``surface`` (L, N, 2 LAGS + 1, 2 LAGS + 1); bands (L, N) are
-    ``valid`` if it is known.
-    """
+    """Offsets (L, N, 2) and quality (L, N) of ``valid`` bands from surfaces of the lags within LAGS around shifts."""
     flat = surface.flatten(0, 1)
     place, _ = integer_peak(flat)
     # the peak comes to the centre, so that it has neighbours on every side to interpolate from
@@ -126,10 +119,7 @@ def fine_offsets(task: BandTask, shift: Tensor, surface: Tensor, valid: Tensor) 
 
 @cache
 def _polynomials(size: int) -> Array:
-    """Matrices (3, size, size) from samples at -(size // 2) ... size // 2 to the coefficients of the polynomial.
-
-    The second and third are those of its first and second derivatives.
-    """
+    """Matrices (3, size, size) from samples around 0 to a polynomial and its first and second derivatives."""
     matrices = [np.linalg.inv(np.vander(np.arange(size) - size // 2.0, increasing=True))]
     for _ in range(2):
         matrices.append(np.roll(np.arange(size)[:, None] * matrices[-1], -1, 0))

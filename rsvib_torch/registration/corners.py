@@ -95,13 +95,14 @@ class CornerFollower:
         # 1. Follow corners.
         (height, width), timing = grey.shape, self._timing
         scale = reduction(*grey.shape) if self._consistent else 1
-        before, known, voted, second = self._before, self._known, self._votes, _reduced(grey, scale)
+        before, known, voted = self._before, self._known, self._votes
+        second = np.asarray(cv2.resize(grey, (width // scale, height // scale), interpolation=cv2.INTER_AREA), np.uint8)
         starts = np.array([self._start, start])
         self._before, self._start = (second, mask), start
         self._known, self._votes = _NO_CORNERS
         if before is None:
             return None
-        found = find_corners(before[0], known, before[1], most=self._most)
+        found = find_corners(before[0], known, before[1], self._most)
         votes, layer = np.pad(voted, (0, len(found) - len(voted))), np.ones(len(found), bool)
         ends, good = follow_corners(before[0], second, found)
         if mask is not None:
@@ -131,10 +132,7 @@ class CornerFollower:
 
 
 def _agreeing(found: Points, ends: Points, axis: int, length: int, scale: int) -> NDArray[np.bool_]:
-    """(N,) bool, whether corners that were followed move with most others of their rows, along ``axis`` of ``length``.
-
-    Frames are reduced by ``scale``.
-    """
+    """(N,) bool, whether corners move with most others of their rows, along ``axis`` of ``length``."""
     agree = np.zeros(len(found), bool)
     if len(found) < _MIN_CORNERS:
         return agree
@@ -176,19 +174,10 @@ def reduction(height: int, width: int) -> int:
     return int(2 ** max(0, math.ceil(0.5 * math.log2(height * width / _MOST_PIXELS))))
 
 
-def _reduced(frame: NDArray[np.uint8], scale: int) -> NDArray[np.uint8]:
-    """Means over squares of ``scale`` px."""
-    if scale == 1:
-        return frame
-    size = (frame.shape[1] // scale, frame.shape[0] // scale)
-    return np.asarray(cv2.resize(frame, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-
-
-def find_corners(grey: NDArray[np.uint8], known: Points, mask: NDArray[np.uint8] | None = None, *, most: int) -> Points:
+def find_corners(grey: Grey, known: Points, mask: Grey | None, most: int) -> Points:
     """The known corners (N, 2) of a frame (H, W), and new ones where a cell has less than half of its number.
 
-    All cells of the frame have the same number; together, they have at most ``most`` corners. There are none where the
-    mask (H, W) is 0.
+    All cells have the same number, together at most ``most`` corners. There are none where the mask (H, W) is 0.
     """
     height, width = grey.shape
     side = min(height, width) / _CELLS
@@ -213,13 +202,8 @@ def find_corners(grey: NDArray[np.uint8], known: Points, mask: NDArray[np.uint8]
     return np.concatenate(corners)
 
 
-def follow_corners(
-    first: NDArray[np.uint8], second: NDArray[np.uint8], corners: Points
-) -> tuple[Points, NDArray[np.bool_]]:
-    """Places (N, 2) of the corners of the first frame in the second, and whether (N) the way back ends at the corner.
-
-    Pyramids of Lucas and Kanade (``cv2.calcOpticalFlowPyrLK``).
-    """
+def follow_corners(first: Grey, second: Grey, corners: Points) -> tuple[Points, NDArray[np.bool_]]:
+    """Places (N, 2) of corners of the first frame in the second, and whether (N) the way back ends at the corner."""
     if not len(corners):
         return corners, np.zeros(0, bool)
     levels = max(1, math.ceil(math.log2(_LARGEST_MOTION * max(first.shape) / _COARSE)) + 1)

@@ -21,7 +21,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from threading import get_ident
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -30,12 +29,7 @@ from torch.nn import functional
 from rsvib_torch.execution.chunking import chunks
 from rsvib_torch.execution.parallel import in_parallel
 from rsvib_torch.numerics.fourier import fast_length
-from rsvib_torch.registration.row_spectra import (
-    combined,
-    differences,
-    inner_columns,
-    mean_over_frames,
-)
+from rsvib_torch.registration.row_spectra import combined, differences, inner_columns, mean_over_frames
 
 BLOCK = 16  # px, side of the blocks of pixels that share a weight
 _SMOOTH = 16  # spectral values averaged along each axis for the power of scene and noise
@@ -50,21 +44,6 @@ _LEAST_ALIASED = 1e-3
 # neighbours as detail: without this, 40 black rows of 360 changed amplitudes by 1 %, 13 standard deviations
 _LEAST_VARIANCE = 0.01
 _NOISE_STEP = 4  # along the rows, every fourth frequency gives the noise power
-
-
-class _WarpedRows(Protocol):
-    """What ``row_gradients`` requires of the frames: ``RowSpectra``, or rows that were joined from strips."""
-
-    @property
-    def width(self) -> int: ...  # columns of a frame
-
-    @property
-    def length(self) -> int: ...  # of the transforms along the rows
-
-    @property
-    def frequencies(self) -> Tensor: ...  # (U,) cycles/px
-
-    def warped_valid(self, rows: Tensor, shift: Tensor) -> Tensor | None: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,42 +74,40 @@ class RowGradients:
 
 
 def row_gradients(
-    spectra: _WarpedRows,
     warp: Callable[[slice], Tensor],
     runs: list[slice],
-    rows: Tensor,
     shift: Tensor,
     visible: Tensor,
-    *,
+    size: tuple[int, int],
+    valid: Tensor | None,
     factors: Callable[[slice], Tensor] | None = None,
 ) -> RowGradients:
     """Gradients of the scene, noise, and the weight of every pixel, from frames warped by a motion.
 
     Args:
-        spectra: The frames of a group.
-        warp: Function from a slice of the S rows of the scene to the frames warped to them, (B, G, s, U), as
+        warp: Function from a slice of the S rows of the scene to the frames of a group warped to them, (B, G, s, U), as
             ``RowSpectra.warped``. Threads call it.
         runs: Slices of the rows that are warped at a time.
-        rows: (B, G, S) frame rows of the S scene rows in each frame.
         shift: (B, G, S) px, displacement along the rows by which each was moved back.
         visible: (B, G, S) float64, 1 where a scene row is visible in a frame.
+        size: Columns of a frame, and length of the transforms along the rows.
+        valid: (B, S, W) bool, pixels of the scene that are valid in all frames; None for all.
         factors: Displacements (B, s, L, 2, A) of the pixels of some rows by unit components of the motion, x and y
             first; the derivatives by all of them are regressors. None if the displacement depends on the row only.
     """
-    length, width = spectra.length, spectra.width
-    compared = FrameComparison.of(warp, runs, visible)
-    detail, along, across, aliasing = scene_detail(compared, spectra.frequencies)
+    (batch, frames, count), (width, length) = visible.shape, size
+    mean, noise, different = _compared(warp, runs, visible)
+    detail, along, across, aliasing = _scene_detail(mean, noise, length)
     inner = functional.pad(inner_columns(width, shift, detail.real), (0, length - width))
-    valid = spectra.warped_valid(rows, shift)
-    parts = chunks(rows.shape[-1], 4 * length * len(rows) * (4 + rows.shape[1]), rows.device, multiple=BLOCK)
+    parts = chunks(count, 4 * length * batch * (4 + frames), visible.device, multiple=BLOCK)
     regressors = 3 if factors is None else 1 + factors(slice(0, 1)).shape[-1]
-    images_of_row = regressors + (1 if rows.shape[1] == 2 else rows.shape[1])
+    images_of_row = regressors + (1 if frames == 2 else frames)
     memory: dict[int, Tensor] = {}  # of each thread, used again
 
     def pixels(part: slice) -> _Rows:
         of_scene, part_visible = detail[:, part].contiguous(), visible[:, :, part]
         if get_ident() not in memory:
-            memory[get_ident()] = inner.new_empty(len(rows), parts[0].stop, images_of_row, length)
+            memory[get_ident()] = inner.new_empty(batch, parts[0].stop, images_of_row, length)
         planes = memory[get_ident()][:, : of_scene.shape[1]]
         planes[:, :, 0], planes[:, :, 1] = (
             torch.fft.irfft(one, n=length) for one in (of_scene * along, across[:, part])
@@ -139,7 +116,7 @@ def row_gradients(
             moved = factors(part).to(planes.dtype)
             by_component = moved[..., 0, :] * planes[:, :, 0, :, None] + moved[..., 1, :] * planes[:, :, 1, :, None]
             planes[:, :, : regressors - 1] = by_component.movedim(-1, 2)
-        for place, one in enumerate((of_scene, *compared.differences[:, :, part].unbind(1)), regressors - 1):
+        for place, one in enumerate((of_scene, *different[:, :, part].unbind(1)), regressors - 1):
             planes[:, :, place] = torch.fft.irfft(one, n=length)
         weight = inner * (part_visible.sum(1) > 1)[..., None].to(inner.dtype)
         if valid is not None:
@@ -147,8 +124,8 @@ def row_gradients(
         return _Rows(planes, weight, part_visible, regressors)
 
     edges = [width * number // 4 for number in range(1, 4)]
-    images = inner.new_empty(len(rows), rows.shape[-1], regressors, length)
-    fitted = in_parallel(lambda part: _fit_rows(pixels(part), edges, images[:, part]), parts, rows.device)
+    images = inner.new_empty(batch, count, regressors, length)
+    fitted = in_parallel(lambda part: _fit_rows(pixels(part), edges, images[:, part]), parts, visible.device)
     fits, blocks = ([part[place] for part in fitted] for place in (0, 1))
     block_weight = _block_weight(*(torch.cat(values, 1) for values in zip(*blocks, strict=True)))
     within = [slice(part.start // BLOCK, -(-part.stop // BLOCK)) for part in parts]
@@ -161,7 +138,7 @@ def row_gradients(
         weight = some.weight * spread[:, : some.weight.shape[1], :length]
         return _fit_rows(replace(some, weight=weight), edges, images[:, parts[place]])[0]
 
-    for place, fit in zip(reweighted, in_parallel(fit_again, reweighted, rows.device), strict=True):
+    for place, fit in zip(reweighted, in_parallel(fit_again, reweighted, visible.device), strict=True):
         fits[place] = fit
     sums, solution, square = (torch.cat(values, 1) for values in zip(*fits, strict=True))
     products, right = _products(sums.sum(2))
@@ -180,10 +157,7 @@ def row_gradients(
 def residual_products(
     warp: Callable[[slice], Tensor], runs: list[slice], gradients: RowGradients, visible: Tensor
 ) -> Tensor:
-    """Products (B, S, A + 1, G) of gradients with the differences of frames, as ``RowGradients.residual_products``.
-
-    The gradients are those of a similar motion; other arguments as in ``row_gradients``.
-    """
+    """``RowGradients.residual_products`` of other frames, or of a similar motion; arguments as in ``row_gradients``."""
     length = gradients.images.shape[-1]
 
     def of_run(rows: slice) -> Tensor:
@@ -229,10 +203,9 @@ class _Rows:
 def _fit_rows(rows: _Rows, edges: list[int], out: Tensor) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
     """Least-squares fit of the differences of the frames by gradients, detail and a constant, row by row.
 
-    ``edges`` are the first columns of the parts of the rows but the first. The images of ``RowGradients`` are written
-    into ``out`` (B, s, A + 1, L). The result has the products from ``_sums_of_parts``, the coefficients (B, s, G, A +
-    2) of the fit and the weighted sum (B, s) of its squared residuals in one frame; and the arguments of
-    ``_block_weight``.
+    The images of ``RowGradients`` are written into ``out`` (B, s, A + 1, L). The result has the products from
+    ``_sums_of_parts``, whose ``edges`` are given, the coefficients (B, s, G, A + 2) of the fit and the weighted sum (B,
+    s) of its squared residuals in one frame; and the arguments of ``_block_weight``.
     """
     images, residual = rows.planes[:, :, : rows.regressors], rows.planes[:, :, rows.regressors :]
     weighted = torch.mul(images, rows.weight[:, :, None], out=out)
@@ -266,10 +239,7 @@ def _means(products: Tensor) -> Tensor:
 
 
 def _sums_of_parts(weighted: Tensor, rows: _Rows, edges: list[int]) -> Tensor:
-    """Products (B, s, parts, A + 2, A + 2 + G) float64 of weighted images and ones with images, differences and ones.
-
-    ``weighted`` (B, s, A + 1, L) is weight times images; ``edges`` as in ``_fit_rows``.
-    """
+    """Products (B, s, parts, A + 2, A + 2 + G) of weighted images and ones with images, differences and ones."""
     count, parts = weighted.shape[2], len(edges) + 1
     sums = weighted.new_empty(*weighted.shape[:2], parts, count + 1, 1 + rows.planes.shape[2], dtype=torch.float64)
     for part, (first, end) in enumerate(itertools.pairwise([0, *edges, None])):
@@ -285,10 +255,7 @@ def _sums_of_parts(weighted: Tensor, rows: _Rows, edges: list[int]) -> Tensor:
 
 
 def _solve(products: Tensor, right: Tensor) -> Tensor:
-    """Coefficients (B, s, G, A + 2) of the fit, with a relative regularisation of 1e-6; 0 for rows without detail.
-
-    ``products`` (B, s, A + 2, A + 2) are those of images and ones, ``right`` (B, s, G, A + 2) those with differences.
-    """
+    """Coefficients (B, s, G, A + 2) of the fit, with a relative regularisation of 1e-6; 0 for rows without detail."""
     diagonal = products.diagonal(dim1=-2, dim2=-1)
     usable = (diagonal > 0).all(-1)[..., None]
     scale = torch.where(usable, diagonal.clamp(min=1e-300).rsqrt(), 0.0)
@@ -316,8 +283,8 @@ def _block_weight(energy: Tensor, slope: Tensor, share: Tensor) -> Tensor:
     """Weight (B, N, M) in 0 ... 1 of blocks, small where the residual exceeds noise and a small shift.
 
     Objects that move by themselves, clouds and parallax leave such residuals. The weight is ``1 / (1 + (r - 1)^2)`` for
-    r > 1, with r the mean square of the residual over ``9 median + (0.15 px)^2 |g|^2``. ``energy`` and ``slope`` (B, N,
-    M) are weighted sums of the squared residual and gradient over each block, ``share`` is that of the weights.
+    r > 1, with r the mean square of the residual over ``9 median + (0.15 px)^2 |g|^2``. Over each block, ``energy`` and
+    ``slope`` are sums of the squared residual and gradient, ``share`` is that of the weights.
     """
     used = share > 0
     mean, slope = energy / share.clamp(min=1e-6), slope / share.clamp(min=1e-6)
@@ -336,73 +303,65 @@ def _quarters(sums: Tensor, solution: Tensor, visible: Tensor) -> Tensor:
     return torch.cat([products, change], dim=-1) * (visible[:, 0] * visible[:, -1])[..., None, None]
 
 
-@dataclass(frozen=True, eq=False)
-class FrameComparison:
-    """Mean of the frames of a group, its noise and the differences of the frames: spectra along S scene rows."""
+def _compared(warp: Callable[[slice], Tensor], runs: list[slice], visible: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean (B, R, U) of warped frames, its noise (B, R, U / 4) and their ``differences``, spectra along S scene rows.
 
-    # (B, R, U), over the frames in which a row is visible. R - S rows of zeros follow, so that transforms across rows
-    # are fast.
-    mean: Tensor
-    noise: Tensor  # (B, R, U / 4), a difference of two frames with the noise of their mean, at every fourth frequency
-    differences: Tensor  # (B, G, S, U), or (B, 1, S, U) of two frames, as from ``differences``
+    R - S rows of zeros follow, so that transforms across rows are fast. Every fourth frequency gives the noise.
+    """
 
-    @classmethod
-    def of(cls, warp: Callable[[slice], Tensor], runs: list[slice], visible: Tensor) -> "FrameComparison":
-        """Compare frames warped to the scene; arguments as in ``row_gradients``."""
-
-        def of_run(rows: slice) -> tuple[Tensor, Tensor, Tensor]:
-            warped, part_visible = warp(rows), visible[:, :, rows]
-            different = differences(warped, part_visible)
-            # half the difference of two frames has the noise of their mean
-            noise = (
-                different[:, 0, :, ::_NOISE_STEP]
-                if warped.shape[1] == 2
-                else _noise_of_mean(warped[..., ::_NOISE_STEP], part_visible)
-            )
-            return mean_over_frames(warped, part_visible), noise, different
-
-        means, noises, different = zip(*in_parallel(of_run, runs, visible.device), strict=True)
-        missing = fast_length(visible.shape[2]) - visible.shape[2]
-        mean, noise = (
-            torch.cat([*parts, parts[0].new_zeros(len(visible), missing, parts[0].shape[-1])], 1)
-            for parts in (means, noises)
+    def of_run(rows: slice) -> tuple[Tensor, Tensor, Tensor]:
+        warped, part_visible = warp(rows), visible[:, :, rows]
+        different = differences(warped, part_visible)
+        # half the difference of two frames has the noise of their mean
+        noise = (
+            different[:, 0, :, ::_NOISE_STEP]
+            if warped.shape[1] == 2
+            else _noise_of_mean(warped[..., ::_NOISE_STEP], part_visible)
         )
-        return cls(mean, noise, torch.cat(different, 2))
+        return mean_over_frames(warped, part_visible), noise, different
+
+    means, noises, different = zip(*in_parallel(of_run, runs, visible.device), strict=True)
+    missing = fast_length(visible.shape[2]) - visible.shape[2]
+    mean, noise = (
+        torch.cat([*parts, parts[0].new_zeros(len(visible), missing, parts[0].shape[-1])], 1)
+        for parts in (means, noises)
+    )
+    return mean, noise, torch.cat(different, 2)
 
 
-def scene_detail(compared: FrameComparison, u: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _scene_detail(mean: Tensor, noise: Tensor, length: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Detail of the scene and its derivatives, by a Wiener filter ``1 - N / P`` of the mean of the frames.
 
     P is the power spectrum of the mean and N that of its noise, both smoothed over 16 x 16 frequencies. The pass band
     excludes shading (below 1/64 cycles/px) and the frequencies that interpolation attenuates; those that are aliased
-    are attenuated. ``u`` (U,) are the frequencies along rows in cycles/px. The result has the spectrum (B, R, U) of the
+    are attenuated. ``length`` is that of the transforms along rows. The result has the spectrum (B, R, U) of the
     detail, the factors (B, 1, U) in px^-1 that make of it the derivative along the rows, the spectrum (B, R, U) of the
     derivative across them, and the size of the bias (B,) in px by aliasing. Neighbours in memory belong to one
     frequency. Both derivatives have the size with which they predict the differences of the frames.
     """
     # 1. Powers. Transforms across rows leave the rows contiguous in memory, and all later loops run along them.
-    whole, noise = (torch.fft.fft(rows, dim=-2).transpose(-2, -1) for rows in (compared.mean, compared.noise))
-    v = torch.fft.fftfreq(whole.shape[-1], dtype=torch.float64, device=u.device)
+    whole, noise = (torch.fft.fft(rows, dim=-2).transpose(-2, -1) for rows in (mean, noise))
+    u = torch.fft.rfftfreq(length, dtype=torch.float64, device=mean.device)
+    v = torch.fft.fftfreq(whole.shape[-1], dtype=torch.float64, device=mean.device)
     total, noise_power = _smoothed(whole, _SMOOTH), _smoothed(noise, _SMOOTH // _NOISE_STEP)
-    of_blocks = _of_blocks(u), _of_blocks(v)
-    bands = _pass_bands(*of_blocks)
+    x, y = (functional.avg_pool1d(f.abs()[None], _SMOOTH, ceil_mode=True)[0] for f in (u, v))  # means of blocks
+    bands = _pass_bands(x, y)
     # 2. The filter.
     wiener = (1 - noise_power / total.clamp(min=torch.finfo(total.dtype).tiny)).clamp(min=0.0)
-    filtered = wiener * _with_little_aliasing(total - noise_power, noise_power, of_blocks[0], *bands)
+    filtered = wiener * _with_little_aliasing(total - noise_power, noise_power, x, *bands)
     torch.view_as_real(whole).mul_(_in_pass_band(filtered, u, v)[..., None])
     # 3. A filter that attenuates frequencies of the scene makes derivatives d too small for least squares: with the
     # true ones g, the sum of ``d g`` is larger than that of ``d^2``.
     passed = filtered * torch.outer(*bands).to(filtered.dtype)
     products, squares = passed * wiener * total, passed.square() * total
-    x, y = (f.square().to(filtered.dtype) for f in of_blocks)
     larger_x, larger_y = (
         ((products * f).sum((1, 2)) / (squares * f).sum((1, 2)).clamp(min=1e-30)).clamp(min=1.0)[:, None, None]
-        for f in (x[:, None], y)
+        for f in (x.square().to(filtered.dtype)[:, None], y.square().to(filtered.dtype))
     )
     detail = torch.fft.ifft(whole)
     whole *= (2j * math.pi * v).to(whole.dtype) * larger_y
     across = torch.fft.ifft(whole)
-    aliasing = _aliasing_bias(total - noise_power, of_blocks[0], *bands)
+    aliasing = _aliasing_bias(total - noise_power, x, *bands)
     along = (2j * math.pi * u).to(whole.dtype) * larger_x
     return detail.transpose(-2, -1), along, across.transpose(-2, -1), aliasing
 
@@ -438,12 +397,15 @@ def _with_little_aliasing(scene_power: Tensor, noise_power: Tensor, u: Tensor, a
 
 
 def _pass_bands(u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-    """Low passes of the gradients along and across rows.
+    """Low passes of the gradients along rows, where detail may be aliased, and across them, where splines attenuate it.
 
-    Along rows, interpolation is exact, but detail near 0.5 cycles/px may be aliased; across rows, the spline
-    attenuates it earlier.
+    They are 1 below a frequency in cycles/px, 0 above another one, and half a cosine between.
     """
-    return _low_pass(u, 0.40, 0.48), _low_pass(v, 0.24, 0.34)
+    along, across = (
+        0.5 + 0.5 * torch.cos(math.pi * ((frequency.abs() - low) / (high - low)).clamp(0.0, 1.0))
+        for frequency, low, high in ((u, 0.40, 0.48), (v, 0.24, 0.34))
+    )
+    return along, across
 
 
 def _aliasing_bias(scene_power: Tensor, u: Tensor, along: Tensor, across: Tensor) -> Tensor:
@@ -462,17 +424,6 @@ def _aliasing_bias(scene_power: Tensor, u: Tensor, along: Tensor, across: Tensor
     return bias.clamp(max=1.0)  # px; without a scene, its power is that of rounding
 
 
-def _of_blocks(frequencies: Tensor) -> Tensor:
-    """Mean sizes (U / 16,) of neighbouring frequencies (U,), as the powers in ``scene_detail``."""
-    means: Tensor = functional.avg_pool1d(frequencies.abs()[None], _SMOOTH, ceil_mode=True)[0]
-    return means
-
-
-def _low_pass(frequency: Tensor, low: float, high: float) -> Tensor:
-    """1 below ``low``, 0 above ``high`` (cycles/px), half a cosine between."""
-    return 0.5 + 0.5 * torch.cos(math.pi * ((frequency.abs() - low) / (high - low)).clamp(0.0, 1.0))
-
-
 def _smoothed(spectrum: Tensor, frequencies: int) -> Tensor:
     """Mean power (B, U / frequencies, S / 16) of blocks of a spectrum (B, U, S), up to a factor."""
     parts = torch.view_as_real(spectrum).flatten(-2)
@@ -487,10 +438,7 @@ def _smoothed(spectrum: Tensor, frequencies: int) -> Tensor:
 
 
 def _noise_of_mean(warped: Tensor, visible: Tensor) -> Tensor:
-    """Difference (B, S, U) of the first and last frame in which a row is visible, with the noise of their mean.
-
-    It is 0 where a row is visible in one frame only.
-    """
+    """Difference (B, S, U) of the first and last frame that contain a row, with the noise of their mean; or 0."""
     count = visible.shape[1]
     order = torch.arange(count, device=visible.device)[:, None]
     first = torch.where(visible > 0, order, count).amin(1, keepdim=True)

@@ -8,6 +8,7 @@ from torch.nn import functional
 
 from rsvib_torch.execution.chunking import chunks
 from rsvib_torch.execution.parallel import in_parallel
+from rsvib_torch.numerics.fourier import fast_length
 from rsvib_torch.registration.bands import (
     BINNING,
     LAGS,
@@ -20,106 +21,68 @@ from rsvib_torch.registration.bands import (
     whole_pixel_peak,
 )
 
-# Zero-mean normalised cross-correlation (NCC), computed with matrix products
+# Zero-mean normalised cross-correlation (NCC)
 
 
 def register_ncc(task: BandTask) -> tuple[Tensor, Tensor]:
-    """Offsets and quality of bands: a search for whole pixels in binned columns, then the peak at full resolution.
-
-    The contract is that of ``BAND_METHODS``.
-    """
+    """Offsets and quality of bands: a search for whole pixels in binned columns, then the peak at full resolution."""
     factor = next((factor for factor in (BINNING, BINNING // 2) if task.width // factor >= 64), 1)
-    reach = -(-task.search // factor)
-    width = task.width // factor
-    binned = [
-        take_windows(image, torch.zeros_like(left), left, image.shape[-2], columns * factor)[:, 0]
-        .unflatten(-1, (columns, factor))
-        .mean(-1)
-        for image, left, columns in (
-            (task.first, task.left[:, None], width),
-            (task.second, (task.left + task.coarse[:, 0])[:, None] - reach * factor, width + 2 * reach),
-        )
-    ]
-    places = task.places
-    rows = places[..., 1]
-    surface = _correlate_bands(
-        binned[0],
-        binned[1],
-        torch.stack([torch.zeros_like(rows), rows], -1),
-        torch.stack([torch.full_like(rows, reach), rows + task.coarse[:, None, 1]], -1),
-        size=(task.height, width),
-        reach=(task.search, reach),
-    )
+    reach, width, height = -(-task.search // factor), task.width // factor, task.first.shape[-2]
+
+    def binned(image: Tensor, left: Tensor, columns: int) -> Tensor:
+        whole = take_windows(image, torch.zeros_like(left), left, height, columns * factor)[:, 0]
+        means: Tensor = whole.unflatten(-1, (columns, factor)).mean(-1)
+        return means
+
+    first = binned(task.first, task.left[:, None], width)
+    left = (task.left + task.coarse[:, 0])[:, None] - reach * factor
+    second = binned(task.second, left, width + 2 * reach)
+    places, rows = task.places, task.places[..., 1]
+    of_first = torch.stack([torch.zeros_like(rows), rows], -1)
+    of_second = torch.stack([torch.full_like(rows, reach), rows + task.coarse[:, None, 1]], -1)
+    surface = _correlate_bands(first, second, of_first, of_second, (task.height, width), (task.search, reach))
     lag, inside = whole_pixel_peak(surface, factor)
     shift = task.start + lag
     moved = places + shift
-    surface = _correlate_bands(
-        task.first, task.second, places, moved, size=(task.height, task.width), reach=(LAGS, LAGS)
-    )
+    surface = _correlate_bands(task.first, task.second, places, moved, (task.height, task.width), (LAGS, LAGS))
     inside &= (moved[..., 1] >= LAGS) & (moved[..., 1] + task.height + LAGS <= task.first.shape[-2])
     return fine_offsets(task, shift, surface, inside)
 
 
 def _correlate_bands(
-    first: Tensor,
-    second: Tensor,
-    places: Tensor,
-    later_places: Tensor,
-    *,
-    size: tuple[int, int],
-    reach: tuple[int, int],
+    first: Tensor, second: Tensor, places: Tensor, later_places: Tensor, size: tuple[int, int], reach: tuple[int, int]
 ) -> Tensor:
     """Zero-mean normalised cross-correlation of windows of one image (L, H, W) with windows of another (L, H, V).
 
-    For one lag along the columns, the correlation at all lags across the rows consists of the diagonal sums of the
-    matrix product of template and search rows. Means and energies of the search windows come from running sums.
-    Templates of ``size`` (rows, columns) begin at ``places`` (L, N, 2) int64 (column, row), the window at lag zero at
+    Products come from Fourier transforms, means and energies of the search windows from running sums. Templates of
+    ``size`` (rows, columns) begin at ``places`` (L, N, 2) int64 (column, row), the window at lag zero at
     ``later_places``. Lags are -reach ... reach across the rows and along the columns. The result (L, N, 2 reach[0] + 1,
     2 reach[1] + 1) is in -1 ... 1; 0 where a window is constant or leaves the image.
     """
     height, width = size
     pixels = height * width
-    bytes_of_band = 8 * len(first) * (height + 2 * reach[0]) * width * first.element_size()  # with its blocks of rows
-    parts = in_parallel(
-        lambda bands: _products_of_bands(first, second, places[:, bands], later_places[:, bands], size, reach),
-        chunks(places.shape[1], bytes_of_band, first.device),
-        first.device,
-    )
+    search_size = height + 2 * reach[0], width + 2 * reach[1]
+    lengths = fast_length(search_size[0]), fast_length(search_size[1])
+
+    def products(bands: slice) -> tuple[Tensor, Tensor, Tensor]:
+        """Sums of the products of templates and windows, of the templates, and of their squares."""
+        begin, later_begin = places[:, bands], later_places[:, bands] - torch.tensor(reach[::-1], device=places.device)
+        template = take_windows(first, begin[..., 1], begin[..., 0], height, width)
+        search = take_windows(second, later_begin[..., 1], later_begin[..., 0], *search_size)
+        spectrum = torch.fft.rfft2(search, s=lengths) * torch.fft.rfft2(template, s=lengths).conj()
+        cross = torch.fft.irfft2(spectrum, s=lengths)[..., : 2 * reach[0] + 1, : 2 * reach[1] + 1]
+        flat = template.flatten(2)
+        sums = flat.sum(-1).double(), torch.linalg.vecdot(flat, flat).double()
+        return cross, sums[0][..., None, None], sums[1][..., None, None]
+
+    bytes_of_band = 4 * len(first) * lengths[0] * lengths[1] * first.element_size()
+    parts = in_parallel(products, chunks(places.shape[1], bytes_of_band, first.device), first.device)
     cross, template_total, template_energy = (torch.cat(values, 1) for values in zip(*parts, strict=True))
     total, energy = _window_sums(second, later_places, size, reach)
     cross = cross - template_total * total / pixels
     energy = energy - total.square() / pixels
     template_energy = template_energy - template_total.square() / pixels
     return _normalise(cross, energy, template_energy, pixels * second.square().mean((-2, -1))[:, None, None, None])
-
-
-def _products_of_bands(
-    first: Tensor, second: Tensor, places: Tensor, later_places: Tensor, size: tuple[int, int], reach: tuple[int, int]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Sums of the products of templates and windows (L, N, lags_y, lags_x), of the templates, and of their squares."""
-    height, width = size
-    template = take_windows(first, places[..., 1], places[..., 0], height, width).flatten(0, 1)
-    top, left = later_places[..., 1] - reach[0], later_places[..., 0] - reach[1]
-    search = take_windows(second, top, left, height + 2 * reach[0], width + 2 * reach[1]).flatten(0, 1)
-    # 1. Blocks of template rows, each with the rows that it is compared with at all lags. For many lags, one block: 45
-    # templates of 32 x 66 px take 8 ms instead of 26 ms with blocks of 8 rows, of 32 x 500 px as long. For few lags,
-    # most row pairs of one block belong to none: blocks of 8 rows take half the time.
-    lags_y, lags_x = 2 * reach[0] + 1, 2 * reach[1] + 1
-    rows = height if lags_y > height else 8
-    if height % rows:
-        template, search = (functional.pad(image, (0, 0, 0, -height % rows)) for image in (template, search))
-    count = template.shape[1] // rows
-    blocks = template.view(-1, rows, width)
-    searched = search.unfold(1, rows + lags_y - 1, rows).mT.flatten(0, 1).contiguous()  # (M b, h + 2 reach, V)
-    # 2. Products of all row pairs for each lag along the columns. Their diagonals are the lags across the rows.
-    products = torch.stack([blocks @ searched[..., lag : lag + width].mT for lag in range(lags_x)])
-    strides = products.stride()
-    diagonals = products.as_strided((*products.shape[:2], rows, lags_y), (*strides[:2], strides[2] + 1, 1)).sum(2)
-    cross = diagonals.view(lags_x, *places.shape[:2], count, lags_y).sum(3).permute(1, 2, 3, 0)
-    # 3. Sums over the templates.
-    template = template.flatten(1)
-    total, energy = template.sum(1), torch.linalg.vecdot(template, template)
-    return cross, total.double().view(*places.shape[:2], 1, 1), energy.double().view(*places.shape[:2], 1, 1)
 
 
 def _normalise(cross: Tensor, energy: Tensor, template_energy: Tensor, typical: Tensor) -> Tensor:
@@ -133,10 +96,7 @@ def _normalise(cross: Tensor, energy: Tensor, template_energy: Tensor, typical: 
 def _window_sums(
     images: Tensor, places: Tensor, size: tuple[int, int], reach: tuple[int, int]
 ) -> tuple[Tensor, Tensor]:
-    """Sums of the values and of their squares over windows at all lags, float64 (L, N, lags_y, lags_x).
-
-    NaN where a window leaves the image.
-    """
+    """Sums of values and squares over windows at all lags, float64 (L, N, lags_y, lags_x); NaN beyond the image."""
     height, width = size
     num_rows, num_columns = images.shape[-2:]
     device = images.device
@@ -171,13 +131,12 @@ def register_phase(task: BandTask) -> tuple[Tensor, Tensor]:
     """Offsets and quality of bands by phase correlation under a Hann window that moves with the scene.
 
     The cross-power spectrum is whitened where it exceeds the noise, and low-passed, so that samples at whole pixels
-    determine its peak. The contract is that of ``BAND_METHODS``.
+    determine its peak.
     """
     places = task.places
     num_rows = task.first.shape[-2]
     # search for whole pixels: these windows contain the band's content at every lag of the search range
-    tall = task.height + 2 * task.search
-    factor = BINNING
+    tall, factor = task.height + 2 * task.search, BINNING
     width = task.width // factor * factor
     up = torch.tensor([0, task.search], device=places.device)
     pair = [
@@ -212,8 +171,7 @@ def _phase_surface(
 ) -> Tensor:
     """Phase correlation of windows (L, N, h, w) at the lags -reach ... reach: (L, N, lags_y, lags_x).
 
-    ``fraction`` (L, N, 2) px is the shift (x, y) of the Hann window of the second; ``pixel`` is the size of the
-    windows' pixels across the rows and along the columns, in px.
+    ``fraction`` (L, N, 2) is the shift of the Hann window of the second, ``pixel`` the size (y, x) of pixels, in px.
     """
     shape = first.shape[:2]
     first, second, fraction = first.flatten(0, 1), second.flatten(0, 1), fraction.flatten(0, 1)
@@ -237,18 +195,13 @@ def _phase_surface(
     weight = low_pass * twice / (magnitude + 10.0 * noise + torch.finfo(first.dtype).tiny)
     full = (magnitude * weight).sum((-2, -1))
     transforms = []
-    for size, frequency in ((reach[0], v), (reach[1], u)):
-        angle = (
-            2
-            * torch.pi
-            * torch.arange(-size, size + 1, dtype=frequency.dtype, device=first.device)[:, None]
-            * frequency
-        )
+    for size, frequency in zip(reach, (v, u), strict=True):
+        lags = torch.arange(-size, size + 1, dtype=frequency.dtype, device=first.device)
+        angle = 2 * torch.pi * lags[:, None] * frequency
         transforms.append(torch.polar(torch.ones_like(angle), angle))
-    surface: Tensor = (transforms[0] @ ((cross * weight) @ transforms[1].T)).real
-    surface = surface / full.clamp(min=torch.finfo(first.dtype).tiny)[:, None, None]
-    lags: Tensor = surface.unflatten(0, shape)
-    return lags
+    surface = (transforms[0] @ ((cross * weight) @ transforms[1].T)).real
+    lags_of_bands: Tensor = (surface / full.clamp(min=torch.finfo(first.dtype).tiny)[:, None, None]).unflatten(0, shape)
+    return lags_of_bands
 
 
 # Gray projection (Sec. 2.2 of Liu et al. 2023)
@@ -258,9 +211,8 @@ def register_projection(task: BandTask) -> tuple[Tensor, Tensor]:
     """Offsets and quality of bands by correlation of profiles, the means of rows and of columns.
 
     Across the rows, the profile of a band is too short for the search range. Windows that are eight search ranges tall
-    therefore give a smooth course of the offset across the rows first. With that shift, the bands give the offset
-    along the rows, and with both shifts the remaining offset across the rows. The contract is that of
-    ``BAND_METHODS``.
+    therefore give a smooth course of the offset first. With that shift, the bands give the offset along
+    the rows, and with both shifts the remaining offset across the rows.
     """
     places = task.places
     course = _smooth_course(_search_rows(task)).round().long()
@@ -280,15 +232,12 @@ def _search_rows(task: BandTask) -> Tensor:
     tall = min(max(task.height, 8 * task.search), num_rows // 2)
     tops = (task.tops + (task.height - tall) // 2).clamp(0, num_rows - tall)
     reach = task.search + LAGS - 1
-    row_means = [
-        functional.pad(
-            _differences(take_windows(image, torch.zeros_like(left), left, num_rows, task.width).mean(-1)), (1, 1)
-        )[:, 0]
-        for image, left in (
-            (task.first, task.left[:, None]),
-            (task.second, (task.left + task.coarse[:, 0])[:, None]),
-        )
+    lefts = task.left[:, None], (task.left + task.coarse[:, 0])[:, None]
+    windows = [
+        take_windows(image, torch.zeros_like(left), left, num_rows, task.width)[:, 0]
+        for image, left in zip((task.first, task.second), lefts, strict=True)
     ]
+    row_means = [functional.pad(_differences(window.mean(-1)), (1, 1)) for window in windows]
     begin = tops + task.coarse[:, 1:] - reach
     later = take_windows(row_means[1][..., None], begin, torch.zeros_like(begin), tall + 2 * reach, 1)[..., 0]
     template = row_means[0][:, tops[:, None] + torch.arange(tall, device=begin.device)]
@@ -312,17 +261,10 @@ def _smooth_course(course: Tensor) -> Tensor:
 
 def _band_profiles(task: BandTask, places: Tensor, shift: Tensor, reach: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Offset of bands beyond ``shift`` along the axis whose ``reach`` (rows, columns) is not 0, (L, N), and quality."""
-    summed = -1 if reach[0] else -2
-    moved = places + shift
-    width = task.width
-    first = take_windows(task.first, places[..., 1], places[..., 0], task.height, width)
-    second = take_windows(
-        task.second,
-        moved[..., 1] - reach[0],
-        moved[..., 0] - reach[1],
-        task.height + 2 * reach[0],
-        width + 2 * reach[1],
-    )
+    summed, moved, height, width = (-1 if reach[0] else -2), places + shift, task.height, task.width
+    first = take_windows(task.first, places[..., 1], places[..., 0], height, width)
+    top, left = moved[..., 1] - reach[0], moved[..., 0] - reach[1]
+    second = take_windows(task.second, top, left, height + 2 * reach[0], width + 2 * reach[1])
     surface = _correlate_profiles(_differences(first.mean(summed)), _differences(second.mean(summed)))
     lags = torch.arange(-reach[0], reach[0] + 1, device=surface.device)
     begin = moved[..., 1, None] + lags
@@ -340,8 +282,8 @@ def _differences(profile: Tensor) -> Tensor:
 def _profile_peak(surface: Tensor) -> tuple[Tensor, Tensor]:
     """Sub-pixel lag of the peaks of correlations (L, N, 2 reach + 1), NaN where there is none, and quality.
 
-    The search range is ``reach - LAGS + 1``, and -infinity marks lags that leave the frame. A peak at the edge of the
-    search range, or next to a lag of -infinity, gives NaN and quality 0.
+    -infinity marks lags that leave the frame. A peak next to one, or at the edge of the search range of ``reach - LAGS
+    + 1``, is none.
     """
     flat = surface.flatten(0, 1)[..., None]
     place, _ = integer_peak(flat)

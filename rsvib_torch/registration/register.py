@@ -150,10 +150,7 @@ def register_bands(frames: FramesOrFiles, timing: SensorTiming, options: BandReg
 
 
 def similar_share(curve: OffsetCurve, columns: int) -> Tensor:
-    """(B,) fraction of the registered bands of frames of ``columns`` px that correlate more than noise; 0 without any.
-
-    Frames of different scenes, and of noise, have offsets as well: of the places with the largest correlation.
-    """
+    """(B,) share of the registered bands of frames of ``columns`` px that correlate more than noise or other scenes."""
     limit = max(0.1, _CHANCE / math.sqrt(max(curve.heights) * columns))
     good = curve.good.flatten(1)
     return ((curve.quality.flatten(1) > limit) & good).double().sum(1) / good.double().sum(1).clamp(min=1.0)
@@ -212,10 +209,7 @@ def register_rows(grey: Tensor, timing: RowTiming, options: RegistrationOptions)
 def _bands_of_pairs(
     grey: Tensor, tops: Tensor, options: RegistrationOptions, advance: Callable[..., None]
 ) -> tuple[Tensor, Tensor]:
-    """Offsets (B, T - 1, N, 2) of bands with first rows ``tops`` in frames (B, T, H, W), and their quality.
-
-    ``advance`` is called with the number of pairs that are done.
-    """
+    """Offsets (B, T - 1, N, 2) of bands with first rows ``tops`` in frames (B, T, H, W), and their quality."""
     band_rows, search = options.band_rows, options.search
     batch, num_frames, _, width = grey.shape
     # a Gaussian of 1 px band-limits the correlation, so that whole-pixel lags determine its peak, and damps noise
@@ -267,9 +261,8 @@ def _coarse_offsets(frames: Tensor) -> Tensor:
     whole = frames[..., : height // factor * factor, : width // factor * factor]
     reduced = _standardised(functional.avg_pool2d(whole, factor))
     rows, columns = reduced.shape[-2:]
-    windows = (
-        torch.hann_window(size, periodic=False, dtype=reduced.dtype, device=reduced.device) for size in (rows, columns)
-    )
+    dtype, device = reduced.dtype, reduced.device
+    windows = (torch.hann_window(size, periodic=False, dtype=dtype, device=device) for size in (rows, columns))
     spectra = torch.fft.rfft2(reduced * torch.outer(*windows).sqrt())
     cross = spectra[:, 1:] * spectra[:, :-1].conj()
     magnitude = cross.abs()

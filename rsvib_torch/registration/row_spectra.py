@@ -35,11 +35,7 @@ class RowSpectra:
     """
 
     def __init__(
-        self,
-        frames: Tensor,
-        valid: Tensor | None = None,
-        level: Tensor | float = 0.0,
-        contrast: Tensor | float = 1.0,
+        self, frames: Tensor, valid: Tensor | None = None, level: Tensor | float = 0.0, contrast: Tensor | float = 1.0
     ) -> None:
         self.height, self.width = frames.shape[-2:]
         self.length = fast_length(self.width + 64)  # 32 px of boundary extension per end close the period smoothly
@@ -82,10 +78,7 @@ class RowSpectra:
         return part
 
     def in_groups(self, count: int) -> "RowSpectra":
-        """Spectra (B M, G) of M = ``count`` groups of the frames of each stack, see ``overlapping``.
-
-        ``values`` stay those of the frames.
-        """
+        """Spectra (B M, G) of ``count`` groups of each stack, see ``overlapping``; ``values`` stay those of frames."""
         if count == 1:
             return self
         part = copy(self)
@@ -114,15 +107,11 @@ class RowSpectra:
         both = copy(self)
         both.values = torch.cat([self.values, later.values], 1)
         both._index_rows()
-        if self.valid is not None or later.valid is not None:
-            masks = [part.all_valid() if part.valid is None else part.valid for part in (self, later)]
-            both.valid = torch.cat(masks, 1)
+        masks = [part.valid for part in (self, later)]
+        if any(mask is not None for mask in masks):
+            everything = self._first_rows.new_ones(1, 1, self.height, self.width, dtype=torch.bool)
+            both.valid = torch.cat([everything if mask is None else mask for mask in masks], 1)
         return both
-
-    def all_valid(self) -> Tensor:
-        """(B, T, H, W) bool mask of frames without invalid pixels."""
-        shape = (*self.values.shape[:2], self.height, self.width)
-        return torch.ones(shape, dtype=torch.bool, device=self.values.device)
 
     def warped(self, rows: Tensor, shift: Tensor) -> Tensor:
         """Spectra (B, T, S, U) of frames at fractional rows, moved back by ``shift`` px; both (B, T, S)."""
@@ -206,8 +195,7 @@ def mean_over_frames(spectra: Tensor, visible: Tensor) -> Tensor:
 def differences(spectra: Tensor, visible: Tensor) -> Tensor:
     """Differences (B, G, S, U) of the rows of each frame from their mean over the frames in which they are visible.
 
-    Of two frames, only the difference of the first, (B, 1, S, U): that of the second is its negative. The difference is
-    0 where a row is not visible.
+    Of two frames, only that of the first, (B, 1, S, U), the negative of the other. 0 where a row is not visible.
     """
     if spectra.shape[1] == 2:
         half = 0.5 * visible.prod(1, keepdim=True)
@@ -229,39 +217,30 @@ EVERY = 4  # rows; every fourth row is enough to estimate a column pattern
 # amplitudes by a tenth of their standard deviation; errors of interpolation of up to 6e-5 were subtracted as a pattern
 # in 5 of 36 recordings without one, which took up to 1.6 times as long
 _LEAST_PATTERN = 3e-4
-_Group = tuple[RowSpectra, Tensor, Tensor, Tensor, Tensor]
 
 
-def column_pattern(groups: list[_Group]) -> Tensor | None:
-    """Spectrum (B, U), shrunk by its noise, of a pattern that is added to every row of every frame at the same columns.
+def column_pattern(groups: list[tuple[RowSpectra, Tensor, Tensor, Tensor, Tensor]]) -> Tensor | None:
+    """Spectrum (B, U), shrunk by its noise, of a pattern that every row of every frame has at the same columns.
 
-    Such a pattern is fixed to the sensor and biases displacements towards zero. In frames warped back by the motion,
-    the pattern p appears as ``p(x + shift)`` while the scene stands still. For each frequency u, the differences of the
-    frames d are therefore regressed on the differences r of ``exp(2 pi i u shift)``, which excludes the scene: ``p(u) =
-    sum conj(r) d / sum |r|^2``. None if no pattern is significant, or if it is too weak to bias displacements.
+    It is fixed to the sensor and biases displacements towards zero. In frames warped back by the motion, the pattern p
+    appears as ``p(x + shift)`` while the scene stands still. For each frequency u, the differences of the frames d are
+    therefore regressed on the differences r of ``exp(2 pi i u shift)``, which excludes the scene: ``p(u) = sum conj(r)
+    d / sum |r|^2``. None if no pattern is significant, or if it is too weak to bias displacements.
 
     The groups are spectra of frames, M of each stack, with the rows, shifts and visibility (B M, G, S each) that warp
-    some of their rows, and the residual variance (B M, S) of these rows. Rows whose variance exceeds three times the
-    median (objects that move by themselves) are left out.
+    some of their rows, and the residual variance (B M, S) of these rows. Objects that move by themselves are left out:
+    rows whose variance exceeds three times the median.
     """
-    # half of the rows are enough to find out that there is no pattern
-    return None if _pattern_of(groups, 2) is None else _pattern_of(groups, 1)
-
-
-def _pattern_of(groups: list[_Group], step: int) -> Tensor | None:
-    """``column_pattern`` from every ``step``-th row."""
     correlation, power, energy, count = (torch.zeros((), dtype=torch.float32, device="cpu") for _ in range(4))
     stacks = len(groups[0][0].values)
 
     def of_stacks(values: Tensor) -> Tensor:
         """Sums (B, ...) over the groups of each stack of values (B M, ...)."""
-        total: Tensor = values.unflatten(0, (stacks, -1)).sum(1)
-        return total
+        return torch.stack(values.tensor_split(stacks)).sum(1)
 
-    for spectra, *places in groups:
-        rows, shift, visible, variance = (values[..., ::step] for values in places)
+    for spectra, rows, shift, shown, variance in groups:
         typical = torch.where(variance > 0, variance, torch.nan).nanmedian(dim=-1, keepdim=True).values
-        visible = visible * ((variance > 0) & (variance < 3.0 * typical))[:, None]
+        visible = shown * ((variance > 0) & (variance < 3.0 * typical))[:, None]
         visible = visible * (visible.sum(1, keepdim=True) > 1)
         # the ends of rows stay in place as well
         inner = inner_columns(spectra.width, shift, spectra.values.real)[:, None]

@@ -25,23 +25,10 @@ _GRID_FRAMES = 24  # frames whose minima over the grid of row times are refined 
 GRID_STEP = 0.02  # of the row time; minima of the residual are 0.1 wide or wider for motions that are accepted
 
 
-@dataclass(frozen=True, eq=False)
-class _Evaluation:
-    """Weighted least squares of a spline at one row time."""
-
-    chi_square: float  # weighted square of the residuals
-    parameters: int  # number of coefficients of both axes
-    step: float  # Gauss-Newton step of the row time in s, with the coefficients fitted again
-    information: float  # inverse variance of the row time, for measurements of unit variance
-
-
 def row_time_of_splines(
     places: FramePlaces, num_rows: int, low: float, high: float, directions: tuple[float, ...]
 ) -> tuple[RowTimeFit, float] | None:
-    """Row time from ``low`` to ``high`` s at which the fewest knots explain the displacements, and their distance in s.
-
-    None if no motion explains them. ``places`` are rows from the top of the image; readout directions are 1.0 and -1.0.
-    """
+    """Row time at which the fewest knots explain the displacements, and their distance in s; None if no motion does."""
     problem = _Problem.of(places, num_rows, high)
     coarse_problem = _Problem.of(places.of_first_frames(_GRID_FRAMES), num_rows, high)
     count = max(1, math.ceil(math.log(high / low) / GRID_STEP))
@@ -52,16 +39,15 @@ def row_time_of_splines(
     while spacing > max(0.7 * blank, 0.1 * period):
         advance, costs = steps(len(grid), "row times"), []
         for tried in grid:
-            costs.append(coarse_problem.evaluate(tried, spacing).chi_square)
+            costs.append(coarse_problem.evaluate(tried, spacing)[0].chi_square)
             advance()
         minima = [i for i, cost in enumerate(costs) if cost <= min(costs[max(i - 1, 0) : i + 2])]
         lowest = sorted(minima, key=costs.__getitem__)[:6]
         found = sorted((problem.refined(grid[i], spacing, low, high) for i in lowest), key=lambda one: one.chi_square)
         # knots twice as close explain noise only
         closer = problem.refined(found[0].row_time, 0.5 * spacing, low, high)
-        coarse, fine = (problem.evaluate(found[0].row_time, step).parameters for step in (spacing, 0.5 * spacing))
-        noise = closer.chi_square / max(1.0, problem.known - fine)
-        added = fine - coarse
+        coarse, fine = (problem.parameters(found[0].row_time, step) for step in (spacing, 0.5 * spacing))
+        noise, added = closer.chi_square / max(1.0, problem.known - fine), fine - coarse
         if found[0].chi_square - closer.chi_square < noise * (added + 3.0 * math.sqrt(2.0 * added)):
             break
         spacing /= 2**0.25
@@ -95,18 +81,26 @@ class _Problem:
         x, y = (places.of_axis(axis, num_rows, row_time) for axis in range(2))
         return cls((x, y), places.period, x.num_measurements + y.num_measurements)
 
-    def evaluate(self, row_time: float, spacing: float) -> _Evaluation:
-        """Splines of both axes at a row time, with knots about ``spacing`` apart."""
-        # 1. The coefficients that each row depends on.
-        record = self.records[0]
-        times = record.frames * self.period + record.rows * row_time
+    def _grid(self, row_time: float, spacing: float) -> tuple[Array, tuple[float, float, int]]:
+        """Times (N, G) in s of the rows, and first knot, distance and number of knots about ``spacing`` apart."""
+        times = self.records[0].frames * self.period + self.records[0].rows * row_time
         first, last = float(times.min()), float(times.max())
         cells = max(1, math.ceil((last - first) / spacing))
-        grid = first, (last - first) / cells, cells + DEGREE
+        return times, (first, (last - first) / cells, cells + DEGREE)
+
+    def parameters(self, row_time: float, spacing: float) -> int:
+        """Number of coefficients of both axes."""
+        return 2 * self._grid(row_time, spacing)[1][2]
+
+    def evaluate(self, row_time: float, spacing: float) -> tuple[Candidate, float]:
+        """Splines of both axes at a row time, and the Gauss-Newton step in s, with the coefficients fitted again."""
+        # 1. The coefficients that each row depends on.
+        record = self.records[0]
+        times, grid = self._grid(row_time, spacing)
         index, basis = spline_taps(times, *grid, degree=DEGREE)
         _, slope = spline_taps(times, *grid, degree=DEGREE, derivative=1)
         weights = np.stack([one.weights for one in self.records])
-        bands = normal_bands(index, basis, record.visible, weights, cells + DEGREE)
+        bands = normal_bands(index, basis, record.visible, weights, grid[2])
         cost, step, information = 0.0, 0.0, 0.0
         for one, weight, band in zip(self.records, weights[..., None], bands, strict=True):
             # 2. The spline.
@@ -120,27 +114,22 @@ class _Problem:
             step += float((weight * unexplained * residual).sum()) * one.independent
             information += float((weight * np.square(unexplained)).sum()) * one.independent
         information = max(information, 1e-300)
-        return _Evaluation(cost, 2 * (cells + DEGREE), step / information, information)
+        return Candidate(row_time, information**-0.5, cost), step / information
 
     def refined(self, row_time: float, spacing: float, low: float, high: float) -> Candidate:
         """Gauss-Newton on the row time from a start in s."""
         size, sign = abs(row_time), math.copysign(1.0, row_time)
         for _ in range(8):
-            found = self.evaluate(sign * size, spacing)
-            change = min(max(sign * found.step, -GRID_STEP * size), GRID_STEP * size)
+            found, step = self.evaluate(sign * size, spacing)
+            change = min(max(sign * step, -GRID_STEP * size), GRID_STEP * size)
             size = min(max(size + change, low), high)
-            if abs(change) < 1e-2 * found.information**-0.5:
+            if abs(change) < 1e-2 * found.std:
                 break
-        found = self.evaluate(sign * size, spacing)
-        return Candidate(sign * size, found.information**-0.5, found.chi_square)
+        return self.evaluate(sign * size, spacing)[0]
 
 
 def _fitted(values: Array, record: RowRecord, index: Array, basis: Array, factor: Array) -> tuple[Array, Array]:
-    """Coefficients of a spline that is fitted to displacements (N, G) of a record, and its residual (N, G).
-
-    Displacements depend on coefficients ``index`` (N, G, M) by the factors ``basis``; ``factor`` is the banded Cholesky
-    factor of the normal matrix.
-    """
+    """Coefficients ``index`` (N, G, M) of ``basis`` functions fitted to values (N, G), and the residual (N, G)."""
     weighted = record.weights[:, None, None] * values[..., None]
     right = np.bincount(index.ravel(), (basis * weighted).ravel(), factor.shape[1])
     solution = linalg.cho_solve_banded((factor, True), right, check_finite=False)

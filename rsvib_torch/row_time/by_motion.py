@@ -167,14 +167,10 @@ def _measured_freely(
     timing = clock.timing(0.5 * clock.period / clock.num_rows)
     starts = timing.frame_starts(stack.images.shape[1], stack.images.device)
     record = (0.0, float(starts[-1]) + clock.num_rows * timing.row_time + timing.exposure_time)
-    timed = replace(
-        curve,
-        times=starts[:-1, None] + curve.rows * timing.row_time,
-        later_times=starts[1:, None] + curve.rows * timing.row_time,
-    )
-    measured_rows, motion, _ = measure_freely(stack, timing, timed, record, options, 24, 4)
-    measured = measured_rows.measurements
-    measured = measured.reweighted(residual_of_motion(measured, motion[0]))
+    times = starts[:, None] + curve.rows * timing.row_time
+    curve = replace(curve, times=times[:-1], later_times=times[1:])
+    rows, motion, _ = measure_freely(stack, timing, curve, record, options, 24, 4)
+    measured = rows.measurements.reweighted(residual_of_motion(rows.measurements, motion[0]))
     residual = residual_of_motion(measured, motion[0])
     measured = replace(measured, independent=measured.independent_fraction(residual))
     return rows_of_frames(measured, clock.period, timing.row_time, clock.num_rows)
@@ -203,9 +199,6 @@ def _result(found: RowTimeFit, clock: CameraClock, notes: list[str]) -> RowTimeC
     return RowTimeCalibration(
         row_time=abs(found.row_time) if known else None,
         row_time_std=found.std if known else None,
-        period_rows=None,
-        contrast=None,
-        flicker_frequency=None,
         frame_rows=clock.period / abs(found.row_time) if known else None,
         readout_direction=directions[found.row_time < 0] if known and len(signs) == 1 else None,
         exposure_time=exposure,

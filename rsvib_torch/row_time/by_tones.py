@@ -11,7 +11,7 @@ import torch
 
 from rsvib_torch.detection.measurements import OtherMotion
 from rsvib_torch.detection.refinement import refine
-from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_intervals
+from rsvib_torch.detection.rows.displacements import compared_intervals
 from rsvib_torch.detection.rows.grouped_frames import grouped_frames
 from rsvib_torch.detection.start import band_curve, measurements_of_curve
 from rsvib_torch.detection.tones.fit import MotionModel, ToneFit, motion_of_fit, residual_of, shrunk
@@ -86,9 +86,9 @@ def row_time_of_tones(
 ) -> RowTimeFit | None:
     """Row time from the tones in the motion of one stack in image order; None if there is no tone.
 
-    The tones of the offsets of the bands, with independent frequencies per row and per frame, give the possible row
-    times. With one of them, rows are measured directly, and the row time is fitted with all tones. The measured
-    displacements then give the possible row times once more, with a hundred times smaller errors.
+    The tones of the bands, with independent frequencies per row and per frame, give the possible row times. With one of
+    them, rows are measured, and the row time is fitted with all tones. These rows then give the possible row times once
+    more, with a hundred times smaller errors.
     """
     highest = 0.5 / options.band_step
     tones = [find_row_tones(places.of_axis(axis, clock.num_rows, clock.high), highest) for axis in range(2)]
@@ -99,8 +99,7 @@ def row_time_of_tones(
         return None
     # all of them give nearly the same displacements; low frequencies, of long row times, blur the frames least
     starts = sorted((one.row_time for one in _as_good_as_the_first(possible)), key=abs, reverse=True)
-    tried: list[float] = []
-    results: list[RowTimeFit] = []
+    tried, results = list[float](), list[RowTimeFit]()
     while starts and len(tried) < MAX_STARTS:
         tried.append(starts.pop(0))
         found = _measured_with(tried[-1], turned(stack, tried[-1]), clock, options, tones)
@@ -156,20 +155,20 @@ class _Direct:
 
     def verdict(self, possible: list[Candidate]) -> RowTimeFit:
         """The row time with the reasons against it."""
-        measured = self.places.timed(abs(self.row_time))
-        residual = residual_of(measured, self.fit)
-        other = {"unexplained": measured.unexplained(residual)[0], "correlated": measured.correlated(residual)[0]}
-        other |= {"size": self.other_motion.size[0], "permitted": self.other_motion.permitted[0]}
-        reasons: list[Reason] = []
+        measured, other = self.places.timed(abs(self.row_time)), self.other_motion
+        residual, reasons = residual_of(measured, self.fit), list[Reason]()
+        other = replace(other, unexplained=measured.unexplained(residual), correlated=measured.correlated(residual))
+        quantities = {**vars(other), "permitted": other.permitted}
         for axis, name in enumerate(AXIS_NAMES[:2]):
-            numbers = {quantity: float(values[axis]) for quantity, values in other.items()}
+            names = ("unexplained", "correlated", "size", "permitted")
+            numbers = {quantity: float(quantities[quantity][0, axis]) for quantity in names}
             reasons += with_remedy(residual_reasons(name, numbers), "use frames in which the vibration is steady")
             count = int(self.fit.active[0, axis].sum())
             if count >= MAX_TONES:
                 reasons.append(Reason("too_many_tones", name, count, MAX_TONES))
         others = tuple(
             one
-            for one in (_as_good_as_the_first(possible) if possible else [])
+            for one in _as_good_as_the_first(possible)
             if abs(one.row_time - self.row_time) > 5 * (one.std + self.std)
         )
         exposure, exposure_std = self.exposure or (None, None)
@@ -185,7 +184,7 @@ def _measured_with(
     timing = clock.timing(size)
     curve = band_curve(stack.images, stack.valid, timing, options, mere_start=True)
     start, _ = robust_fit(measurements_of_curve(curve, timing, options.band_step), frequencies, active, MotionModel())
-    intervals, device = table(compared_intervals(timing, stack.images.shape[1], MAX_GROUP_FRAMES)), stack.images.device
+    intervals, device = compared_intervals(timing, stack.images.shape[1]), stack.images.device
     exposure = None
     for _ in range(4):
         rows = grouped_frames(stack.images, stack.valid, timing, motion_of_fit(shrunk(start, intervals), device))
@@ -220,10 +219,7 @@ def _row_tones(places: FramePlaces, fit: ToneFit, axis: int, row_time: float, cl
 
 
 def _exposure(other: OtherMotion, timing: RowTiming) -> tuple[float, float] | None:
-    """Exposure time in s and its standard deviation from the difference of the blur between frames; None if unknown.
-
-    Its ratio to the expected difference is the square of the ratio of the exposure times.
-    """
+    """Exposure time in s and its standard deviation from the difference of the blur between frames; None if unknown."""
     ratio, std, size = other.blur[0].tolist()
     # interpolation errors change ratio * size by about 0.005, finite differences change the ratio by a fifth
     uncertainty = math.hypot(std, 0.005 / max(size, 1e-12), 0.2 * ratio)

@@ -57,14 +57,14 @@ class RowTimeCalibration(
 
     row_time: float | None
     row_time_std: float | None
-    period_rows: float | None
-    contrast: float | None
-    flicker_frequency: float | None
-    frame_rows: float | None
-    readout_direction: Literal["forward", "reverse"] | None
-    exposure_time: float | None
-    exposure_time_std: float | None
-    notes: tuple[str, ...]
+    period_rows: float | None = None
+    contrast: float | None = None
+    flicker_frequency: float | None = None
+    frame_rows: float | None = None
+    readout_direction: Literal["forward", "reverse"] | None = None
+    exposure_time: float | None = None
+    exposure_time_std: float | None = None
+    notes: tuple[str, ...] = ()
     candidates: tuple[float, ...] = ()
     reliable: bool = True
     findings: tuple[Reason, ...] = ()
@@ -220,9 +220,8 @@ def _direction(
 ) -> tuple[Literal["forward", "reverse"] | None, float, str]:
     """Readout direction from consecutive frames, contrast of the light, and why the direction is undetermined.
 
-    The phase of the light advances by ``f / frame_rate`` turns per frame, the pattern of the scene does not move: the
-    fundamental of frame p is ``d + a exp(-2 pi j p f / frame_rate)`` for forward readout, with the opposite sign of the
-    exponent for reverse readout.
+    The pattern of the scene does not move: the fundamental of frame p is ``d + a exp(-2 pi j p f / frame_rate)`` for
+    forward readout, with the opposite sign of the exponent for reverse readout.
     """
     first = bands.coefficients[:, 0]
     contrast = float(np.abs(first).mean())

@@ -100,15 +100,14 @@ def _solve(matrix: Array, right: Array) -> Array:
 
 def unexplained(matrix: Array, values: Array) -> Array:
     """Residual of a least-squares fit of (T, H, N) to (T, H)."""
-    residual: Array = values - (matrix @ _solve(matrix, values)[..., None])[..., 0]
-    return residual
+    return values - (matrix @ _solve(matrix, values)[..., None])[..., 0]
 
 
 def deviations(jacobian: Array, residual: Array, reach: int) -> Array:
     """Standard deviations (N,) of fitted parameters, with the correlation of residuals within ``reach`` rows.
 
-    The derivatives of the model are (T, H, N), the residuals (T, H). The covariance of the residuals is weighted by
-    Bartlett's window. The result is not smaller than for residuals without correlation.
+    The derivatives of the model are (T, H, N), the residuals (T, H), weighted by Bartlett's window. The result is not
+    smaller than for residuals without correlation.
     """
     information = np.linalg.pinv(np.einsum("tin,tim->nm", jacobian, jacobian))
     score = jacobian * residual[..., None]
@@ -118,15 +117,14 @@ def deviations(jacobian: Array, residual: Array, reach: int) -> Array:
     sums = (correlated, np.einsum("tin,tim->nm", score, score))
     variances = [np.diag(information @ total @ information) for total in sums]
     variances.append((residual**2).mean() * np.diag(information))
-    std: Array = np.sqrt(np.max(variances, axis=0).clip(min=0.0))
-    return std
+    return np.sqrt(np.max(variances, axis=0).clip(min=0.0))
 
 
 def _fit_period(brightness: Array, start: float, scene: SceneModel) -> BandFit | None:
     """Fit bands to the brightness (T, H) of rows, with the number of harmonics that maximises the evidence.
 
-    The brightness of a ``"smooth"`` scene is a polynomial along the rows, one for each frame; of a ``"fixed"`` scene
-    that times a texture of the rows, which is the same in all frames while the bands move. None if the fit diverges.
+    The brightness of a ``"smooth"`` scene is a polynomial along the rows, one for each frame; that of a ``"fixed"``
+    scene has a texture of the rows as well, which is the same in all frames. None if the fit diverges.
     """
     best: BandFit | None = None
     worse = 0  # numbers in a row; a square wave has no even harmonics
@@ -248,8 +246,7 @@ def _certainty(coefficients: Array, residual: Array, period: float) -> float:
 def _less_parabola(curves: Array) -> Array:
     """Curves (..., H) less the parabola that fits each of them."""
     smooth = np.linalg.qr(np.polynomial.chebyshev.chebvander(np.linspace(-1, 1, curves.shape[-1]), 2))[0]
-    flat: Array = curves - curves @ smooth @ smooth.T
-    return flat
+    return curves - curves @ smooth @ smooth.T
 
 
 def _starts(brightness: Array) -> list[float]:
@@ -272,10 +269,7 @@ def _starts(brightness: Array) -> list[float]:
 
 
 def find_bands(profiles: Profiles) -> tuple[BandFit, SceneModel]:
-    """The bands whose period has the smallest relative standard deviation, and the model of the scene.
-
-    Several frames of a still scene are fitted together if their bands move, which eliminates the texture of the scene.
-    """
+    """The bands with the best known period, and the model of the scene, which several frames separate if bands move."""
     brightness = profiles.rows
     scenes: list[tuple[SceneModel, Array]] = [("smooth", brightness)]
     if len(brightness) > 1:

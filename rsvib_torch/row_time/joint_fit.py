@@ -13,7 +13,6 @@ import numpy as np
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.tones.fit import ToneFit, fit_tones, motion_of_fit
 from rsvib_torch.detection.tones.uncertainty import linearised
-from rsvib_torch.motion.motion import Motion
 from rsvib_torch.numerics.tables import Array, table, tensor
 from rsvib_torch.row_time.row_tones import RowRecord
 
@@ -41,10 +40,9 @@ class FramePlaces:
     def of_axis(self, axis: int, num_rows: int, row_time: float) -> RowRecord:
         """The displacements along one axis, for tones of independent frequencies."""
         measured = self.measurements
-        frames = self.frames[0] - 0.5 * (self.frames.min() + self.frames.max())
         return RowRecord(
             self.rows[0] - 0.5 * (num_rows - 1),
-            frames,
+            self.frames[0] - 0.5 * (self.frames.min() + self.frames.max()),
             measured.displacements[0, ..., axis],
             measured.visible[0],
             measured.inverse_variances[0, :, axis],
@@ -60,26 +58,16 @@ def rows_of_frames(measured: Measurements, period: float, row_time: float, num_r
     return FramePlaces(measured, (measured.exposure_starts - frames * period) / row_time, frames, period)
 
 
-def row_time_columns(measured: Measurements, rows: Array, motion: Motion) -> Array:
-    """Derivatives (1, N, G, 2) of the relative displacements by the row time: velocity times row."""
-    starts, exposure = tensor(measured.exposure_starts), measured.exposure_time
-    velocity = (motion.displacement(starts + exposure) - motion.displacement(starts)) / exposure
-    return measured.relative(table(velocity) * rows[..., None])
-
-
-def fit_row_time(
-    places: FramePlaces, row_time: float, fit: ToneFit, *, iterations: int = 12
-) -> tuple[float, float, ToneFit]:
-    """Gauss-Newton on the row time, with all tones fitted again in every step.
-
-    The measurements have the weights of a robust fit. The result is the row time in s, its standard deviation, and the
-    tones.
-    """
-    std = 0.0
-    for _ in range(iterations):
+def fit_row_time(places: FramePlaces, row_time: float, fit: ToneFit) -> tuple[float, float, ToneFit]:
+    """Row time in s, its standard deviation, and the tones, by Gauss-Newton with all tones fitted in every step."""
+    std, exposure = 0.0, places.measurements.exposure_time
+    for _ in range(12):
         measured = places.timed(row_time)
         fit = fit_tones(measured, fit.frequencies, fit.active, fit.model)
-        by_row_time = row_time_columns(measured, places.rows, motion_of_fit(fit))[..., None]
+        # derivatives of the displacements by the row time: velocity times row
+        motion, starts = motion_of_fit(fit), tensor(measured.exposure_starts)
+        velocity = (motion.displacement(starts + exposure) - motion.displacement(starts)) / exposure
+        by_row_time = measured.relative(table(velocity) * places.rows[..., None])[..., None]
         # the part of the change by the row time that no change of the tones cancels
         information = step = 0.0
         for axis, problem in linearised(measured, fit):

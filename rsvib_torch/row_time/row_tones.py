@@ -38,8 +38,7 @@ class RowRecord:
         """Values (N, G, ...) less their mean over the frames that contain the row; 0 in other frames."""
         seen = self.visible.reshape(*self.visible.shape, *(1,) * (values.ndim - 2))
         mean = (seen * values).sum(1, keepdims=True) / np.maximum(seen.sum(1, keepdims=True), 1.0)
-        difference: Array = seen * (values - mean)
-        return difference
+        return seen * (values - mean)
 
     @property
     def num_measurements(self) -> float:
@@ -109,10 +108,7 @@ def _linear(record: RowRecord, values: Array, nu: float, phi: float) -> Array:
 
 
 def _peaks(record: RowRecord, residual: Array, highest: float, count: int) -> list[tuple[float, float]]:
-    """The strongest peaks (nu, phi) of the periodogram of the differences between neighbouring frames.
-
-    A difference of a tone between neighbouring frames is a tone with the same nu and phi, of another amplitude.
-    """
+    """The strongest peaks (nu, phi) of the periodogram of the differences between neighbouring frames."""
     weight = (record.weights[:, None] * record.visible[:, 1:] * record.visible[:, :-1]).ravel()
     difference = np.diff(residual, axis=1).ravel()
     difference = difference - (weight * difference).sum() / max(weight.sum(), 1e-300)
@@ -126,13 +122,10 @@ def _peaks(record: RowRecord, residual: Array, highest: float, count: int) -> li
     return [(float(nu[i]), float(phi[j])) for i, j in zip(*np.unravel_index(best, power.shape), strict=True)]
 
 
-def find_row_tones(record: RowRecord, highest: float, *, max_tones: int = 4) -> RowTones:
-    """Find and fit the tones of one axis, strongest first, until the next one is not significant.
-
-    The search ends at ``highest`` cycles per row.
-    """
+def find_row_tones(record: RowRecord, highest: float) -> RowTones:
+    """Find and fit the tones of one axis up to ``highest`` cycles per row, until the next one is not significant."""
     found = fit_row_tones(record, np.zeros(1))
-    for _ in range(max_tones):
+    for _ in range(4):
         tried = [
             fit_row_tones(record, _linear(record, found.values, nu, phi), iterations=40)
             for nu, phi in _peaks(record, found.residual, highest, 4)
@@ -143,9 +136,8 @@ def find_row_tones(record: RowRecord, highest: float, *, max_tones: int = 4) -> 
             break
         trial = min(tried, key=lambda fit: fit.cost)
         spare = record.num_measurements - len(trial.values)
-        if spare < len(trial.values) or found.cost - trial.cost <= max(
-            F_THRESHOLD * 4 * trial.cost / spare, MIN_SHARE * found.cost
-        ):
+        needed = max(F_THRESHOLD * 4 * trial.cost / max(spare, 1.0), MIN_SHARE * found.cost)
+        if spare < len(trial.values) or found.cost - trial.cost <= needed:
             break
         found = trial
     return found
@@ -176,15 +168,12 @@ class RowTimeFit:
     findings: tuple[Reason, ...] = ()  # reasons why the row time is not certain
 
 
-def candidates(
-    frequencies: Array, covariances: Array, period: float, low: float, high: float, *, floor: float = 1e-5
-) -> list[Candidate]:
+def candidates(frequencies: Array, covariances: Array, period: float, low: float, high: float) -> list[Candidate]:
     """All row times with ``low <= |T_row| <= high`` that are a local minimum of chi-square, the best first.
 
-    Frequencies (K, 2) are in cycles per row and per frame, with covariances (K, 2, 2); times are in s. ``floor`` is an
-    error of phi in cycles that is assumed in addition.
+    Frequencies (K, 2) are in cycles per row and per frame, with covariances (K, 2, 2); times are in s.
     """
-    nu, phi = frequencies.T
+    (nu, phi), floor = frequencies.T, 1e-5  # cycles, error of phi that is assumed in addition
 
     def misfit(inverse: float) -> tuple[Array, Array]:
         """Distance (K,) from a whole number in cycles and its variance, for ``P / T_row``."""
@@ -196,9 +185,8 @@ def candidates(
     for tone in range(len(nu)):
         near, far = float(nu[tone]) * period / high, float(nu[tone]) * period / low
         for sign in (1.0, -1.0):
-            bounds = sorted((sign * near, sign * far))
-            first, last = (math.ceil(bounds[0] - float(phi[tone])), math.floor(bounds[1] - float(phi[tone])))
-            for k in range(first, last + 1):
+            lowest, highest = sorted((sign * near, sign * far))
+            for k in range(math.ceil(lowest - float(phi[tone])), math.floor(highest - float(phi[tone])) + 1):
                 inverse = float((phi[tone] + k) / max(nu[tone], 1e-12))
                 for _ in range(5):
                     distance, variance = misfit(inverse)

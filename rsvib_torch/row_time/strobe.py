@@ -44,14 +44,7 @@ class StrobeFit:
             )
 
 
-def fit_strobe(
-    brightness: Array,
-    period: float,
-    phases: Array,
-    on_fraction: float,
-    *,
-    fixed: bool = False,
-) -> list[StrobeFit]:
+def fit_strobe(brightness: Array, period: float, phases: Array, on_fraction: float, *, fixed: bool) -> list[StrobeFit]:
     """Fit the bands of an on-off light: the overlap of its pulses with the exposure of each row, and constant light.
 
     ``brightness`` (T, H) is in proportion to light; ``period`` in rows, and ``phases`` (T,) of the fundamental, ``cos(2
@@ -101,13 +94,10 @@ def fit_strobe(
 
 
 def exposure_from_shape(fits: list[StrobeFit], on_fraction: float) -> tuple[float, float, str]:
-    """Exposure in rows with its standard deviation, and a note on other light, from fits of one exposure.
+    """Exposure in rows with its standard deviation, and a note on other light; an error if several explain the bands.
 
     Without other light the mean brightness over that of the bands determines the number of whole periods. Other light
     increases the mean, so exposures that it implies are upper limits.
-
-    Raises:
-        ValueError: If several exposures explain the bands.
     """
     found = []  # exposure in periods, share of other light, fit
     for fit in fits:
@@ -134,10 +124,7 @@ def exposure_from_shape(fits: list[StrobeFit], on_fraction: float) -> tuple[floa
 
 
 def exposure_from_contrast(contrast: float, light_contrast: float, period: float) -> float:
-    """Exposure that attenuates a sine of known contrast to the contrast of the bands: ``sinc(f T_e)``, first lobe.
-
-    The result has the unit of the period 1/f; the contrast is the amplitude of the fundamental over the mean.
-    """
+    """Exposure, in units of the period, that attenuates a sine to the contrast of the bands by ``sinc(f T_e)``."""
     ratio = contrast / light_contrast
     if ratio > 1.0:
         raise ValueError(

@@ -141,20 +141,16 @@ class TrackedFrame:
         # The offset curve with the weights that a fit to these rows would have.
         robust = measurements.reweighted(residual_of(measurements, fit))
         weights = robust.weights / np.maximum(measurements.weights, 1e-300)
-        curve, fitted = offset_curve(robust, fit, weights, [2], self.frame.images.device)
-        interval, scale = float(measurements.interval.mean()), FieldScale(2, width, height)
-        user_timing, findings = self.frame.image_timing, (self.tones.findings,)
         results = assembled(
             fit,
             std,
             None,
-            curve,
-            fitted,
-            findings,
-            user_timing,
-            scale=scale,
+            offset_curve(robust, fit, weights, [2], self.frame.images.device),
+            (self.tones.findings,),
+            self.frame.image_timing,
+            scale=FieldScale(2, width, height),
             num_frames=self.options.window,
-            interval=interval,
+            interval=float(measurements.interval.mean()),
         )
         return results[0]
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from motion_truth import common_warp, offset_error, rms
-from truth import MARGIN, Curve, Motion, draw_scene, take_frames
+from truth import MARGIN, Curve, Motion, draw_scene, recorded, take_frames
 
 import rsvib_torch as rsv
 
@@ -75,9 +75,8 @@ def test_standard_deviations_near_a_sudden_step(scene):
     assert (rms(without_frame_mean(error)) < 2.5 * found.std_seen.numpy()).all()
 
 
-def test_colour_and_scan_along_columns(scene, found):
+def test_colour_and_scan_along_columns(frames, found):
     timing = rsv.SensorTiming(TIMING.row_time, 20, TIMING.frame_rows, scan_axis=-1, readout_direction="reverse")
-    frames = torch.from_numpy(take_frames(scene, TIMING, Jitter(), FRAMES, 0.005)).float()
     turned = frames.flip(-2).transpose(-2, -1)
     other = rsv.detect_motion(turned[:, None].expand(-1, 3, -1, -1), timing)
     expected = found.displacement.flip(-1) * torch.tensor([-1.0, 1.0])
@@ -85,14 +84,10 @@ def test_colour_and_scan_along_columns(scene, found):
     assert torch.allclose(other.std, found.std.flip(-1), rtol=1e-3)
 
 
-def test_image_motion_is_separated(scene):
-    wide = draw_scene(HEIGHT + 2 * MARGIN + 160, WIDTH + 2 * MARGIN + 160, 6)
-
-    scan = Curve(
-        lambda times: np.stack([1.5 * np.sin(2 * np.pi * 5.3 * times / SPAN), -500.0 * (times - 0.5 * SPAN)], axis=-1)
-    )
-    frames = take_frames(wide, TIMING, scan, FRAMES, 0.005, margin=MARGIN + 80)
-    found = rsv.detect_motion(torch.from_numpy(frames).float(), TIMING)
+def test_image_motion_is_separated():
+    scan = Curve(lambda t: np.stack([1.5 * np.sin(2 * np.pi * 5.3 * t / SPAN), -500.0 * (t - 0.5 * SPAN)], axis=-1))
+    frames = recorded((HEIGHT, WIDTH), TIMING, scan, FRAMES, 0.005, seed=6, margin=MARGIN + 80)
+    found = rsv.detect_motion(frames, TIMING)
     assert found.motion.tones.image_motion[1] == pytest.approx(-500.0, rel=5e-3)
     error = found.displacement.numpy() - scan.displacement(found.times.numpy())
     assert (rms(without_frame_mean(error - error.mean((0, 1)))) < 0.1).all()
@@ -162,8 +157,7 @@ class Ringing(Motion):
 
 def test_offsets_of_all_pairs_are_measured_despite_an_unobservable_tone():
     """A tone at the frame rate is equivalent to a warp of the scene: it is not observable and affects nothing else."""
-    scene = draw_scene(HEIGHT + 2 * MARGIN, 112 + 2 * MARGIN, 12)
-    frames = torch.from_numpy(take_frames(scene, TIMING, Ringing(), 8, 0.005)).float()
+    frames = recorded((HEIGHT, 112), TIMING, Ringing(), 8, 0.005, seed=12)
     found = rsv.detect_motion(frames, TIMING)
     times = (TIMING.row_starts(8, HEIGHT) + 0.5 * TIMING.exposure_time).numpy()
     truth, motion = Ringing().displacement(times), found.motion.displacement(torch.from_numpy(times)).numpy()
@@ -188,8 +182,7 @@ class Humming(Motion):
 
 
 def test_nearly_blind_motion_has_an_unknown_common_part():
-    scene = draw_scene(HEIGHT + 2 * MARGIN, 112 + 2 * MARGIN, 12)
-    frames = torch.from_numpy(take_frames(scene, TIMING, Humming(), 5, 0.005)).float()
+    frames = recorded((HEIGHT, 112), TIMING, Humming(), 5, 0.005, seed=12)
     found = rsv.detect_motion(frames, TIMING)
     truth = Humming().displacement(found.times.numpy())
     error = found.displacement.numpy() - (truth - truth.mean((0, 1)))

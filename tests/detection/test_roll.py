@@ -92,8 +92,9 @@ def test_without_roll_the_result_is_the_same():
     assert torch.equal(found.std.frequency, without.std.frequency)
 
 
-def test_ignored_roll_is_named_as_the_reason(rolling):
-    found = detect_vibration(rolling[1], TIMING, roll=False, zoom=False)
+@pytest.mark.parametrize("function", [detect_vibration, detect_motion])
+def test_ignored_roll_is_named_as_the_reason(rolling, function):
+    found = function(rolling[1], TIMING, roll=False, zoom=False)
     assert not bool(found.reliable[0])
     (apart,) = (reason for reason in found.findings[0] if reason.code == "halves_apart")
     assert apart.value > apart.limit
@@ -138,13 +139,6 @@ def test_free_motion_with_roll(rolling):
     assert (rms < 2.5 * found.std_seen.numpy()).all()
     assert rms[2] < 0.03 * np.sqrt((true[..., 2] ** 2).mean())  # of the roll itself: no roll is 100 %
     assert "rad" in str(found)
-
-
-def test_free_motion_without_roll_refuses_rolling_frames(rolling):
-    found = detect_motion(rolling[1], TIMING)
-    assert not bool(found.reliable[0])
-    (apart,) = (reason for reason in found.findings[0] if reason.code == "halves_apart")
-    assert "pass roll=True" in str(apart)
 
 
 def test_visible_pixels_follow_the_roll():

@@ -22,19 +22,14 @@ TIMES = torch.arange(-0.02, 0.3, 2e-4, dtype=torch.float64)
 def wrong(error: float, std: float) -> SensorTiming:
     """The timing with a row time that is wrong by a relative error, with the same exposure and frame rate in s."""
     row_time = (1 + error) * TIMING.row_time
-    return SensorTiming.from_seconds(
-        row_time=row_time,
-        row_time_std=std * row_time,
-        exposure_time=TIMING.exposure_time,
-        frame_rate=TIMING.frame_rate,
-    )
+    seconds = {"exposure_time": TIMING.exposure_time, "frame_rate": TIMING.frame_rate}
+    return SensorTiming.from_seconds(row_time=row_time, row_time_std=std * row_time, **seconds)
 
 
 def frames_of(path: torch.Tensor, count: int) -> torch.Tensor:
     """Frames of a motion with some noise."""
-    frames = simulate_frames(
-        city_and_fields(280, 220, seed=3), TIMING, FreeMotion.through(TIMES, path), num_frames=count
-    )
+    motion = FreeMotion.through(TIMES, path)
+    frames = simulate_frames(city_and_fields(280, 220, seed=3), TIMING, motion, num_frames=count)
     return frames + 0.002 * torch.randn(frames.shape, generator=torch.Generator().manual_seed(1))
 
 

@@ -31,9 +31,22 @@ def make_scene():
     return draw_scene(HEIGHT + 2 * MARGIN, WIDTH + 2 * MARGIN, 6)
 
 
+def taken(scene, timing, motion, count, noise=0.004, size=(HEIGHT, WIDTH)):
+    """Frames of a part of the scene."""
+    part = scene[: size[0] + 2 * MARGIN, : size[1] + 2 * MARGIN]
+    return torch.from_numpy(take_frames(part, timing, motion, count, noise)).float()
+
+
+def agrees(found, times=4, share=0.002, **truths):
+    """Whether all errors are within a number of standard deviations and a share of the value."""
+    errors = {name: (getattr(found, name) - true).abs() for name, true in truths.items()}
+    allowed = {name: times * found.std[name] + share * true for name, true in truths.items()}
+    return all(bool((errors[name] < allowed[name]).all()) for name in truths)
+
+
 @pytest.fixture(scope="module", name="frames")
 def make_frames(scene):
-    return torch.from_numpy(take_frames(scene, TIMING, Swept(), FRAMES, 0.005)).float()
+    return taken(scene, TIMING, Swept(), FRAMES, 0.005)
 
 
 @pytest.fixture(scope="module", name="found")
@@ -73,26 +86,22 @@ NEAR_BLIND = rsv.SensorTiming(row_time=4e-5, exposure_rows=20, frame_rows=220)
 def test_two_frames_are_refused(scene):
     steady = tone(1.6, 90.0, phase=1.0)
     timing = rsv.SensorTiming(row_time=4e-5, exposure_rows=20, frame_rows=300)  # blind at 83.3 Hz
-    frames = torch.from_numpy(take_frames(scene, timing, steady, 3, 0.002)).float()
+    frames = taken(scene, timing, steady, 3, 0.002)
     two = rsv.detect_swept_tone(frames[:2], timing)
     assert not two.reliable.any()
     assert all(of_axis[0].code == "too_few_frames_for_sweep" for of_axis in two.findings)
     three = rsv.detect_swept_tone(frames, timing)
     assert three.reliable.all()
-    for name, true in (("amplitude", 1.6), ("frequency", 90.0), ("decay", 0.0), ("chirp", 0.0)):
-        assert ((getattr(three, name) - true).abs() < 4 * three.std[name] + 0.002).all(), name
+    assert agrees(three, amplitude=1.6, frequency=90.0, decay=0.0, chirp=0.0)
     assert (three.std["frequency"] < 0.5).all()
 
 
 def test_other_minima_are_left(scene):
     # from one start, the fit ended at 6.8 ± 0.3 Hz, 11.2 ± 0.6 px with a decay of 112 ± 3 /s
     swept = tone(1.7, 29.3, decay=16.9, chirp=461.0, phase=-0.4)
-    small = scene[: 192 + 2 * MARGIN, : 96 + 2 * MARGIN]
-    frames = torch.from_numpy(take_frames(small, NEAR_BLIND, swept, 4, 0.004)).float()
-    found = rsv.detect_swept_tone(frames, NEAR_BLIND)
+    found = rsv.detect_swept_tone(taken(scene, NEAR_BLIND, swept, 4, size=(192, 96)), NEAR_BLIND)
     assert found.reliable.all()
-    for name, true in (("amplitude", 1.7), ("frequency", 29.3), ("decay", 16.9), ("chirp", 461.0)):
-        assert ((getattr(found, name) - true).abs() < 5 * found.std[name]).all(), name
+    assert agrees(found, times=5, share=0.0, amplitude=1.7, frequency=29.3, decay=16.9, chirp=461.0)
     assert (found.std["frequency"] < 1.5).all()
 
 
@@ -117,13 +126,10 @@ def test_a_tone_that_sweeps_through_a_blind_frequency_is_known(scene):
     """Its frequency is twice the frame rate in the middle of the record, and 1.8 and 2.2 times at the ends."""
     rate, count = NEAR_BLIND.frame_rate, 8
     start, chirp = 1.8 * rate, 0.4 * rate**2 / count
-    frames = take_frames(
-        scene[: 192 + 2 * MARGIN, : 128 + 2 * MARGIN], NEAR_BLIND, tone(1.3, start, chirp=chirp), count, 0.004
-    )
+    frames = taken(scene, NEAR_BLIND, tone(1.3, start, chirp=chirp), count, size=(192, 128))
     found = rsv.detect_swept_tone(frames, NEAR_BLIND)
     assert found.reliable.all()
-    for name, true in (("amplitude", 1.3), ("frequency", start), ("chirp", chirp)):
-        assert ((getattr(found, name) - true).abs() < 4 * found.std[name] + 0.002 * true).all(), name
+    assert agrees(found, amplitude=1.3, frequency=start, chirp=chirp)
 
 
 @pytest.mark.parametrize("contrast", [0.02, 0.3])  # of the scene; without the check 4.20 ± 0.08 px for 0.02
@@ -147,12 +153,9 @@ def test_long_record_is_followed_from_the_part_with_the_largest_offsets(scene):
     # starts are searched in 67 of these 90 frames
     timing = rsv.SensorTiming(row_time=6e-5, exposure_rows=20, frame_rows=110)
     swept = tone(2.5, 83.0, decay=8.0, chirp=20.0, phase=0.4)
-    small = scene[: 100 + 2 * MARGIN, : 128 + 2 * MARGIN]
-    frames = torch.from_numpy(take_frames(small, timing, swept, 90, 0.004)).float()
-    found = rsv.detect_swept_tone(frames, timing)
+    found = rsv.detect_swept_tone(taken(scene, timing, swept, 90, size=(100, 128)), timing)
     assert found.reliable.all()
-    for name, true in (("amplitude", 2.5), ("frequency", 83.0), ("decay", 8.0), ("chirp", 20.0)):
-        assert ((getattr(found, name) - true).abs() < 4 * found.std[name] + 0.002 * true).all(), name
+    assert agrees(found, amplitude=2.5, frequency=83.0, decay=8.0, chirp=20.0)
 
 
 def test_columns_read_in_reverse(frames, found):
@@ -168,8 +171,7 @@ def test_columns_read_in_reverse(frames, found):
 
 def test_axis_without_motion_has_no_tone(scene):
     along_x = Curve(lambda t: np.stack([2 * np.exp(-10 * t) * np.sin(2 * np.pi * 45 * t), 0 * t], -1))
-    frames = torch.from_numpy(take_frames(scene, TIMING, along_x, 3, 0.005)).float()
-    found = rsv.detect_swept_tone(frames, TIMING)
+    found = rsv.detect_swept_tone(taken(scene, TIMING, along_x, 3, 0.005), TIMING)
     assert found.amplitude[1] == 0
     assert found.findings[1] == (Reason("no_tone", "y"),)
     assert found.frequency[0].item() == pytest.approx(45.0, rel=0.02)

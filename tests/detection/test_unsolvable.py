@@ -39,10 +39,9 @@ def test_one_frame_is_refused(function):
         function(torch.rand(1, SIZE, SIZE), TIMING)
 
 
-@pytest.mark.parametrize(("count", "size", "seed"), [(4, 256, 0)])
-def test_independent_noise_at_a_low_frame_rate_has_no_vibration(count, size, seed):
+def test_independent_noise_at_a_low_frame_rate_has_no_vibration():
     """Few rows agree by chance, and slow tones of many pixels explain them; without the verdict they are reliable."""
-    noise = 0.5 + 0.1 * torch.randn(count, size, size, generator=torch.Generator().manual_seed(seed))
+    noise = 0.5 + 0.1 * torch.randn(4, 256, 256, generator=torch.Generator().manual_seed(0))
     found = rsv.detect_vibration(noise, rsv.SensorTiming(50e-6, 10, 1600))
     assert not found.reliable.any()
     assert all("rows_not_registered" in [reason.code for reason in against] for against in found.findings)

@@ -8,47 +8,27 @@ import torch
 
 from rsvib_torch import SensorTiming, Vibration
 from rsvib_torch.detection.measurements import OtherMotion
-from rsvib_torch.detection.verdict import BandOffsets, judged
+from rsvib_torch.detection.verdict import compared_bands, judged
 from rsvib_torch.motion.vibration import VibrationStd
 
 TIMING = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=2048)
 
 
-def verdict(
-    amplitude=3.0,
-    frequency=30.0,
-    *,
-    std=(0.01, 0.01),
-    displacement_std=0.01,
-    known_std=None,
-    offsets=None,
-    fitted=None,
-    rows=None,
-    **options,
-):
+def same(curve):
+    return curve
+
+
+def verdict(amplitude=3.0, frequency=30.0, *, std=(0.01, 0.01), displacement_std=0.01, known_std=None, **options):
     """Reasons against a vibration along x (y: 2 px at 50 Hz) with 40 bands, or with the motion of ``rows``."""
     vibration = Vibration([[[amplitude], [2.0]]], [[[frequency], [50.0]]])
-    size = torch.tensor([[[std[0]], [0.01]]], dtype=torch.float64)
-    hertz = torch.tensor([[[std[1]], [0.01]]], dtype=torch.float64)
-    curve = np.sin(np.linspace(0, 12, 40))[:, None] * np.array([3.0, 2.0])
-    bands = BandOffsets(
-        (curve if offsets is None else offsets(curve))[None],
-        (curve if fitted is None else fitted(curve))[None],
-        np.ones((1, 40), dtype=bool),
-    )
-    std_of_tones = VibrationStd(
-        amplitude=size,
-        frequency=hertz,
-        phase=hertz,
-        period=size,
-        image_motion=torch.zeros(1, 2),
-        image_acceleration=torch.zeros(1, 2),
-        displacement=torch.tensor([[displacement_std, 0.01]]),
-    )
+    size, hertz = (torch.tensor([[[value], [0.01]]], dtype=torch.float64) for value in std)
+    curve, nothing = np.sin(np.linspace(0, 12, 40))[:, None] * np.array([3.0, 2.0]), torch.zeros(1, 2)
+    offsets, fitted = (options.pop(name, same)(curve)[None] for name in ("offsets", "fitted"))
+    bands = compared_bands(offsets, fitted, np.ones((1, 40), dtype=bool))
     (findings,) = judged(
         vibration,
-        std_of_tones,
-        bands if rows is None else rows,
+        VibrationStd(size, hertz, size, hertz, nothing, nothing, torch.tensor([[displacement_std, 0.01]])),
+        options.pop("rows", bands),
         intervals=np.array([0.04096]),
         displacement=np.array([[amplitude, 2.0]]) / 2**0.5,
         known_std=np.array([[displacement_std if known_std is None else known_std, 0.01]]),

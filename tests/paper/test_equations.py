@@ -64,10 +64,10 @@ def test_equations_6_to_8_invert_the_offsets(amplitude, frequency, phase):
         amplitude, frequency, phase, ends
     )
     starts, offsets = ROWS[None, ::8] * CAMERA.row_time, np.stack([offset, offset], -1)[None]
+    both = np.stack([starts, starts + CAMERA.frame_period], -1)
+    displacements = np.stack([-0.5 * offsets, 0.5 * offsets], 2)
     information = np.broadcast_to(np.eye(2), (1, offsets.shape[1], 2, 2))
-    measurements = Measurements.of_pairs(
-        starts, starts + CAMERA.frame_period, offsets, information, CAMERA.exposure_time, (0.0, 0.0)
-    )
+    measurements = Measurements(both, displacements, np.ones_like(both), information, CAMERA.exposure_time)
     start = np.full((1, 2, 1), 1.02 * frequency)
     found, _ = vibration_of_fit(fit_tones(measurements, start, np.ones((1, 2, 1), dtype=bool)))
     for axis in (0, 1):

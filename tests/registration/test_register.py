@@ -4,7 +4,7 @@ from typing import get_args
 import numpy as np
 import pytest
 import torch
-from truth import Motion, draw_scene, take_frames
+from truth import Motion, draw_scene, recorded
 
 from rsvib_torch import SensorTiming, register_bands
 from rsvib_torch.options import Registration
@@ -12,10 +12,6 @@ from rsvib_torch.options import Registration
 METHODS = get_args(Registration)
 # RMS error in px along the rows and along the scan axis, valid bands only; the offsets are 1.4 and 5 px RMS
 RMS = {"projection": (0.08, 0.8), "ncc": (0.03, 0.08), "phase": (0.025, 0.04)}
-
-
-def float_frames(frames):
-    return torch.from_numpy(frames).float()
 
 
 def true_offsets(curve, timing, motion):
@@ -34,9 +30,7 @@ def true_offsets(curve, timing, motion):
 
 @pytest.fixture(scope="module")
 def pair(paper_camera):
-    motion = Motion()
-    scene = draw_scene(2048 + 80, 448 + 80, 31)
-    return float_frames(take_frames(scene, paper_camera, motion, noise=0.003, seed=1)), motion
+    return recorded((2048, 448), paper_camera, Motion(), 2, 0.003, seed=31), Motion()
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -59,8 +53,7 @@ def test_uniform_shift_to_subpixel(method, shift):
     timing = SensorTiming(row_time=10e-6, exposure_rows=0.01, frame_rows=1000)
     # this image motion displaces frames as a whole; within a frame it is negligible
     motion = Motion(amplitude=(0.0, 0.0), image_motion=(shift[0] / 10e-3, shift[1] / 10e-3))
-    scene = draw_scene(512 + 80, 512 + 80, 5)
-    frames = float_frames(take_frames(scene, timing, motion))
+    frames = recorded((512, 512), timing, motion, 2, seed=5)
     curve = register_bands(frames, timing, method=method)
     error = curve.offsets.numpy() - true_offsets(curve, timing, motion)
     limit = {"projection": (0.05, 0.05), "ncc": (0.03, 0.05), "phase": (0.03, 0.03)}[method]
@@ -180,15 +173,14 @@ def test_batch_channels_and_pairs_equal_singles(pair, paper_camera, method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize(("scan_axis", "direction"), [(-2, "reverse"), (-1, "reverse")])
-def test_orientation(pair, paper_camera, method, scan_axis, direction):
+@pytest.mark.parametrize("scan_axis", [-2, -1])
+def test_orientation(pair, paper_camera, method, scan_axis):
     frames = pair[0][:, :512, :256]
     upright = register_bands(frames, paper_camera, method=method)
-    turned = frames.flip(-2) if direction == "reverse" else frames
-    turned = turned.transpose(-2, -1) if scan_axis == -1 else turned
-    timing = replace(paper_camera, scan_axis=scan_axis, readout_direction=direction)
+    turned = frames.flip(-2) if scan_axis == -2 else frames.flip(-2).transpose(-2, -1)
+    timing = replace(paper_camera, scan_axis=scan_axis, readout_direction="reverse")
     result = register_bands(turned, timing, method=method)
-    expected = upright.offsets * torch.tensor([1.0, -1.0 if direction == "reverse" else 1.0])
+    expected = upright.offsets * torch.tensor([1.0, -1.0])
     expected = expected.flip(-1) if scan_axis == -1 else expected
     torch.testing.assert_close(result.offsets, expected, rtol=0, atol=1e-6, equal_nan=True)
     assert torch.equal(result.rows, upright.rows)
@@ -197,14 +189,14 @@ def test_orientation(pair, paper_camera, method, scan_axis, direction):
 
 
 @pytest.mark.parametrize(
-    ("options", "error", "message"),
+    ("options", "message"),
     [
-        ({"method": "sift"}, ValueError, "registration must be one of 'projection', 'ncc', 'phase'; got 'sift'"),
-        ({"search": 60}, ValueError, "frames of 256 x 200 px .* bands of 32 rows searched over 60 px"),
-        ({"band_rows": 240}, ValueError, "too small for bands of 240 rows"),
+        ({"method": "sift"}, "registration must be one of 'projection', 'ncc', 'phase'; got 'sift'"),
+        ({"search": 60}, "frames of 256 x 200 px .* bands of 32 rows searched over 60 px"),
+        ({"band_rows": 240}, "too small for bands of 240 rows"),
     ],
 )
-def test_bad_options(paper_camera, options, error, message):
+def test_bad_options(paper_camera, options, message):
     frames = torch.rand(2, 256, 200, generator=torch.Generator().manual_seed(0))
-    with pytest.raises(error, match=message):
+    with pytest.raises(ValueError, match=message):
         register_bands(frames, paper_camera, **options)

@@ -26,35 +26,20 @@ def blink(time, frequency=1000.0, fraction=0.5):
     return 2.0 * ((time * frequency) % 1.0 < fraction)
 
 
-def record_frames(
-    light,
-    *,
-    frames=1,
-    frame_rate=29.97,
-    exposure=65e-6,
-    row_time=ROW_TIME,
-    scene=0.3,
-    noise=0.002,
-    reverse=False,
-    seed=0,
-    start=0.0123,
-):
-    """Frames (T, H, W) of light over time, summed over the exposure of each row in small steps."""
-    height = HEIGHT if np.ndim(scene) == 0 else len(scene)
-    rows = np.arange(height)[::-1] if reverse else np.arange(height)
-    shots = exposure if np.ndim(exposure) else [exposure] * frames
-    steps = (np.arange(100) + 0.5) / 100
-    begin = start + np.arange(len(shots))[:, None] / frame_rate + rows * row_time
-    lit = np.stack([light(b[:, None] + e * steps).mean(-1) * e / shots[0] for b, e in zip(begin, shots, strict=True)])
-    picture = scene * np.ones((height, WIDTH)) if np.ndim(scene) == 0 else scene
-    taken = lit[:, :, None] * picture
+def record_frames(light, frames=1, frame_rate=29.97, exposure=65e-6, scene=0.3, reverse=False, **shot):
+    """Frames (T, H, W) of light over time, a mean over the exposure of each row in small steps."""
+    shot = {"row_time": ROW_TIME, "noise": 0.002, "seed": 0, "start": 0.0123, **shot}
+    rows, steps = np.arange(HEIGHT)[::-1] if reverse else np.arange(HEIGHT), (np.arange(100) + 0.5) / 100
+    begin = shot["start"] + np.arange(frames)[:, None] / frame_rate + rows * shot["row_time"]
+    taken = light(begin[..., None] + exposure * steps).mean(-1)[..., None] * scene * np.ones((HEIGHT, WIDTH))
+    noise, seed = shot["noise"], shot["seed"]
     noisy = taken + noise * np.random.default_rng(seed).standard_normal(taken.shape)
     return torch.from_numpy(np.clip(noisy, 0, 1)).float()
 
 
-def shaded(height=HEIGHT, width=WIDTH):
+def shaded():
     """A uniform wall with vignetting and a light spot."""
-    v, u = np.meshgrid(np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij")
+    v, u = np.meshgrid(np.linspace(-1, 1, HEIGHT), np.linspace(-1, 1, WIDTH), indexing="ij")
     return 0.35 * (1 - 0.5 * (u**2 + v**2)) + 0.1 * np.exp(-((u - 0.4) ** 2 + (v + 0.3) ** 2) / 0.3)
 
 
@@ -93,15 +78,8 @@ def test_texture_is_removed_by_several_frames():
 def test_periodic_texture_is_not_detected_as_flicker():
     """A pattern with twice the period also fits the texture, but it does not move between frames."""
     frequency, row_time = 583.7, 19.47e-6  # the phase changes by a third of a period per frame; the period is 88 rows
-    frames = record_frames(
-        lambda t: sine(t, frequency, 0.1),
-        frames=4,
-        scene=0.6 * draw_scene(HEIGHT, WIDTH, 22),
-        row_time=row_time,
-        noise=0.003,
-        frame_rate=frequency / 19.472,
-        seed=22,
-    )
+    scene, shot = 0.6 * draw_scene(HEIGHT, WIDTH, 22), {"row_time": row_time, "noise": 0.003, "seed": 22}
+    frames = record_frames(lambda t: sine(t, frequency, 0.1), 4, frequency / 19.472, scene=scene, **shot)
     found = calibrate_row_time(frames, frequency)
     assert found.row_time == pytest.approx(row_time, rel=2e-3)
 

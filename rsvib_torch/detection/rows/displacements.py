@@ -18,21 +18,14 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements, trimmed_mean
-from rsvib_torch.detection.rows.warping import Positions, differently_blurred, second_moments, warp_to_scene
+from rsvib_torch.detection.rows.warping import Positions, differently_blurred, exposure_paths, moments, warp_to_scene
 from rsvib_torch.execution.chunking import chunks, runs
-from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.numerics.fourier import extend_rows, fast_length
 from rsvib_torch.numerics.tables import Array, table, tables
-from rsvib_torch.registration.gradients import (
-    BLOCK,
-    RowGradients,
-    residual_products,
-    row_equations,
-    row_gradients,
-)
+from rsvib_torch.registration.gradients import BLOCK, RowGradients, residual_products, row_equations, row_gradients
 from rsvib_torch.registration.row_spectra import EVERY, RowSpectra, column_pattern, overlapping
 
 BLOCK_ROWS = 8  # rows of one measurement; tones up to 1 / (16 T_row) are resolved
@@ -61,11 +54,6 @@ class FrameGroups:
         """(B M, G) s."""
         return overlapping(self.starts, self.count)
 
-    @property
-    def spectra_of_groups(self) -> RowSpectra:
-        """Spectra (B M, G)."""
-        return self.spectra.in_groups(self.count)
-
     def motion_of_groups(self, motion: Motion) -> Motion:
         """The motion (B) for each group (B M)."""
         return motion if self.count == 1 else motion.mapped(lambda values: values.repeat_interleave(self.count, 0))
@@ -78,12 +66,10 @@ class FrameGroups:
 # Groups of frames
 
 
-def compared_intervals(
-    timing: RowTiming, num_frames: int, max_group_frames: int, device: torch.device | None = None
-) -> Tensor:
+def compared_intervals(timing: RowTiming, num_frames: int, max_group_frames: int = MAX_GROUP_FRAMES) -> Array:
     """Times (M,) in seconds between all frames that are compared with each other in groups of limited size."""
-    starts = timing.frame_starts(num_frames, device)
-    return torch.cat([starts[step:] - starts[:-step] for step in range(1, min(num_frames, max_group_frames))])
+    starts = table(timing.frame_starts(num_frames))
+    return np.concatenate([starts[step:] - starts[:-step] for step in range(1, min(num_frames, max_group_frames))])
 
 
 def stack_spectra(frames: Tensor, valid: Tensor | None, strips: ColumnStrips | None = None) -> RowSpectra:
@@ -114,12 +100,10 @@ def frame_groups(
     pairs: Literal["never", "different", "very different"] = "never",
     one_at_a_time: bool = False,
 ) -> list[FrameGroups]:
-    """Frames in groups of at most ``MAX_GROUP_FRAMES``, each sharing one frame with the next group.
+    """Frames in groups of at most ``MAX_GROUP_FRAMES`` that have half of a frame in common in spite of an image motion.
 
-    An image motion limits how many frames contain the same part of the scene. ``pairs``: form pairs if exposures blur
-    the frames differently, or very differently: only the blur of two frames can then be equalised. Pairs are enough for
-    a tone; a free motion needs all frames that contain a row. As many groups as fit in the cache are measured together,
-    unless ``one_at_a_time``.
+    ``pairs``: whether to form pairs if exposures blur the frames differently, or very differently: only the blur of two
+    frames can then be equalised. As many groups as fit in the cache are measured together, unless ``one_at_a_time``.
     """
     stacks, count = spectra.values.shape[:2]
     starts = timing.frame_starts(count, spectra.values.device).expand(stacks, -1)
@@ -146,42 +130,25 @@ def frame_groups(
 
 
 def measure_group(
-    group: FrameGroups,
-    timing: RowTiming,
-    motion: Motion,
-    gradients: RowGradients | None = None,
+    group: FrameGroups, timing: RowTiming, motion: Motion, gradients: RowGradients | None = None
 ) -> tuple["MeasuredGroup", RowGradients]:
     """Displacements of blocks of scene rows in the frames of groups, measured around a motion of each stack.
 
-    The displacement of the motion is added to the measured residual displacement, so that the measurements do not
-    depend on the motion to first order. The gradients (B M) of the scene are computed unless those of a motion that
-    differs by much less than a pixel are given; they are returned with the measurements, for the next call.
+    The measurements do not depend on the motion to first order. The gradients (B M) of the scene are computed unless
+    those of a motion that differs by much less than a pixel are given; they are returned for the next call.
     """
-    spectra, motion = group.spectra_of_groups, group.motion_of_groups(motion)
+    spectra, motion = group.spectra.in_groups(group.count), group.motion_of_groups(motion)
     positions = Positions.of(group.starts_of_groups, spectra.height, timing, motion)
     visible = positions.visible(spectra.height, BLOCK_ROWS)
     warp = warp_to_scene(spectra, positions, timing, motion)
     runs_of_rows = spectra.runs(positions.rows.shape[-1], 2)
     if gradients is None:
-        gradients = row_gradients(spectra, warp, runs_of_rows, positions.rows, positions.shift, visible)
+        valid, size = spectra.warped_valid(positions.rows, positions.shift), (spectra.width, spectra.length)
+        gradients = row_gradients(warp, runs_of_rows, positions.shift, visible, size, valid)
         products = gradients.residual_products
     else:
         products = residual_products(warp, runs_of_rows, gradients, visible)
     return _measured(group, timing, motion, positions.exposure_starts, visible, gradients, products), gradients
-
-
-@dataclass(frozen=True, eq=False)
-class _JoinedRows:
-    """Rows of full width, joined from strips that were warped alone; as ``RowSpectra`` for ``row_gradients``."""
-
-    width: int  # columns of a frame
-    length: int  # of the transforms along the rows
-    frequencies: Tensor  # (U,) cycles/px
-    valid: Tensor | None  # (B, S, W) bool, pixels of the scene that are valid in all frames; None for all
-
-    def warped_valid(self, rows: Tensor, shift: Tensor) -> Tensor | None:
-        """``valid``: the strips have been warped."""
-        return self.valid
 
 
 def measure_strips(
@@ -193,28 +160,18 @@ def measure_strips(
     factors: Callable[[Tensor, Tensor], Tensor],
     gradients: RowGradients | None = None,
 ) -> tuple["MeasuredGroup", RowGradients]:
-    """``measure_group`` for a motion with roll or zoom, from frames (B S) that are cut into S strips of columns.
+    """``measure_group`` for a motion (B) with roll or zoom, from frames (B S) that are cut into S strips of columns.
 
-    Every strip is warped by the motion of its middle. Strips are joined with weights that are linear between middles,
-    which moves the columns between them by the amount between: exactly to first order of the difference. Rows of full
-    width then measure all A components of the motion at once, with the derivatives of the scene by roll and zoom as
-    further regressors.
-
-    Args:
-        group: The strips of the frames of one group.
-        timing: The sensor, in row order.
-        motion: Motion (B) whose components are measured.
-        of_strips: The motions (B S) of the middles of the strips.
-        strips: The strips.
-        factors: Function of positions x and y in px from the centre to displacements (..., 2, A) by unit components.
-        gradients: As in ``measure_group``.
+    Every strip is warped by the motion ``of_strips`` (B S) of its middle. Strips are joined with weights that are
+    linear between middles, which moves the columns between them by the amount between: exactly to first order. Rows of
+    full width then measure all A components of the motion at once. ``factors`` are the displacements (..., 2, A) by
+    unit components at positions x and y in px from the centre.
     """
     spectra, count = group.spectra, len(strips.firsts)
     positions = Positions.of(group.starts, spectra.height, timing, of_strips)
 
     def over_strips(values: Tensor) -> Tensor:
-        split: Tensor = values.unflatten(0, (-1, count))
-        return split
+        return values.unflatten(0, (-1, count))
 
     visible = over_strips(positions.visible(spectra.height, BLOCK_ROWS)).amin(1)
     warp = warp_to_scene(spectra, positions, timing, of_strips)
@@ -223,25 +180,22 @@ def measure_strips(
 
     def joined(run: slice) -> Tensor:
         pixels = torch.fft.irfft(warp(run), n=spectra.length)[..., : spectra.width]
-        spectrum: Tensor = torch.fft.rfft(extend_rows(strips.joined(pixels), length, hold=0.0))
-        return spectrum
+        return torch.fft.rfft(extend_rows(strips.joined(pixels), length, hold=0.0))
 
     if gradients is None:
         valid = spectra.warped_valid(positions.rows, positions.shift)
-        whole = None if valid is None else strips.joined(valid.to(spectra.values.real.dtype)) > 0.999
-        frequencies = torch.fft.rfftfreq(length, dtype=torch.float64, device=positions.rows.device)
-        shape = _JoinedRows(strips.frame_width, length, frequencies, whole)
-        x = torch.arange(length, device=frequencies.device) - 0.5 * (strips.frame_width - 1)
+        x = torch.arange(length, device=visible.device) - 0.5 * (strips.frame_width - 1)
         x = x - over_strips(positions.columns)[:, 0]  # (B, 1, L)
         y = over_strips(positions.scene_rows)[:, 0, 0, :, None] - 0.5 * (spectra.height - 1)
+        # a lens may displace invisible rows by any amount
+        largest_shift = over_strips(positions.shift).abs().amax(1) * (visible > 0)
         gradients = row_gradients(
-            shape,
             joined,
             runs_of_rows,
-            over_strips(positions.rows)[:, 0],
-            over_strips(positions.shift).abs().amax(1)
-            * (visible > 0),  # a lens may displace invisible rows by any amount
+            largest_shift,
             visible,
+            (strips.frame_width, length),
+            None if valid is None else strips.joined(valid.to(spectra.values.real.dtype)) > 0.999,
             factors=lambda part: factors(x, y[:, part]),
         )
         products = gradients.residual_products
@@ -270,11 +224,7 @@ def _measured(
     gradients: RowGradients,
     products: Tensor,
 ) -> MeasuredGroup:
-    """Measurements of blocks from the products of the gradients with the differences of the frames.
-
-    The motion (B M) has the components that are measured; ``exposure_starts`` (B M, G, S) are in s, ``visible`` (B M,
-    G, S) is 1 where a scene row is visible in a frame, ``products`` as ``RowGradients.residual_products``.
-    """
+    """Measurements of blocks of rows (B M, G, S) around a motion (B M) from ``RowGradients.residual_products``."""
     residual, information = _solved(*row_equations(products, gradients, visible))
     exposure_starts = _in_blocks(exposure_starts).mean(3)
     # a fit of frames with a wrong timing may place rows at any distance; they are invisible, but their times would make
@@ -297,10 +247,7 @@ def _of_stacks(values: Tensor, groups: int) -> Tensor:
 
 
 def _solved(information: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
-    """Displacements (B, G, N, A) of blocks and their information (B, N, A, A), from the equations of rows.
-
-    Blocks with structure along one direction only have a singular matrix; both are 0 then.
-    """
+    """Displacements (B, G, N, A) of blocks and their information (B, N, A, A); 0 with structure along one direction."""
     information = _in_blocks(information[:, None]).sum(3)[:, 0]
     right = _in_blocks(right).sum(3)
     xx, yy = information[..., 0, 0], information[..., 1, 1]
@@ -322,35 +269,11 @@ def _solved(information: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
 def _in_blocks(values: Tensor) -> Tensor:
     """Rows on axis 2 as blocks of ``BLOCK_ROWS`` rows on axes 2 and 3; the remaining rows are left out."""
     count = values.shape[2] // BLOCK_ROWS
-    blocks: Tensor = values[:, :, : count * BLOCK_ROWS].unflatten(2, (count, BLOCK_ROWS))
-    return blocks
-
-
-def measure_groups(
-    groups: list[FrameGroups],
-    timing: RowTiming,
-    motion: Motion,
-    gradients: list[RowGradients] | None = None,
-    *,
-    keep_images: bool = True,
-) -> tuple[Measurements, list[RowGradients]]:
-    """``measure_group`` of all groups, the measurements as one record; ``keep_images`` for further rounds."""
-    known = [None] * len(groups) if gradients is None else gradients
-    measured, advance = [], steps(sum(group.count for group in groups), "groups")
-    for group, of_group in zip(groups, known, strict=True):
-        part, of_part = measure_group(group, timing, motion, of_group)
-        measured.append((part, of_part if keep_images else of_part.without_images()))
-        advance(group.count)
-    count = sum(group.count for group in groups)
-    measurements = joined_groups([part for part, _ in measured], timing.exposure_time, count)
-    return measurements, [of_group for _, of_group in measured]
+    return values[:, :, : count * BLOCK_ROWS].unflatten(2, (count, BLOCK_ROWS))
 
 
 def joined_groups(parts: list[MeasuredGroup], exposure_time: float, groups: int = 1) -> Measurements:
-    """Measurements of all groups as one record, by one transfer to the CPU.
-
-    Smaller groups get frames in which no row is visible.
-    """
+    """Measurements of all groups as one record; smaller groups get frames in which no row is visible."""
     arrays = tables(*(value for part in parts for value in vars(part).values()))
     starts, displacements, visible, information = (arrays[first::4] for first in range(4))
     most = max(part.shape[2] for part in starts)
@@ -375,48 +298,41 @@ def joined_groups(parts: list[MeasuredGroup], exposure_time: float, groups: int 
 def column_pattern_of(
     groups: list[FrameGroups], timing: RowTiming, motion: Motion, gradients: list[RowGradients]
 ) -> Tensor | None:
-    """Spectrum (B, U) of a pattern of columns that is fixed to the sensor; None if there is none.
-
-    The pattern would pull all displacements to zero.
-    """
+    """``column_pattern`` of every fourth row of all groups."""
     parts = []
     for group, of_group in zip(groups, gradients, strict=True):
-        starts, of_groups = group.starts_of_groups, group.motion_of_groups(motion)
-        positions = Positions.of(starts, group.spectra.height, timing, of_groups, EVERY)
-        visible = positions.visible(group.spectra.height, BLOCK_ROWS // EVERY)
-        variance = of_group.variance[:, ::EVERY]
-        parts.append((group.spectra_of_groups, positions.rows, positions.shift, visible, variance))
+        height, of_groups = group.spectra.height, group.motion_of_groups(motion)
+        positions = Positions.of(group.starts_of_groups, height, timing, of_groups, EVERY)
+        visible, variance = positions.visible(height, BLOCK_ROWS // EVERY), of_group.variance[:, ::EVERY]
+        spectra = group.spectra.in_groups(group.count)
+        parts.append((spectra, positions.rows, positions.shift, visible, variance))
     return column_pattern(parts)
 
 
-def differential_motion(gradients: list[RowGradients], stacks: int, *, rows: int = 64) -> Array:
-    """(B, 2) px, rms difference of the residual displacements of the two halves of the rows, without its noise.
-
-    Rotation of the camera and parallax move the halves differently. Arguments as in ``_rms_of_contrasts``.
-    """
-    return _rms_of_contrasts(gradients, stacks, rows, [[-1.0, 1.0]])
+_SUMMED_ROWS = 64  # rows of a sum from which the displacements of parts of the rows are found
 
 
-def uneven_motion(gradients: list[RowGradients], stacks: int, *, rows: int = 64) -> Array:
-    """(B, 2) px, part of the displacements of the quarters of the rows that is not linear in the column; without noise.
+def differential_motion(gradients: list[RowGradients], stacks: int) -> Array:
+    """(B, 2) px, rms difference of the displacements of the halves of the rows, by rotation or parallax; no noise."""
+    return _rms_of_contrasts(gradients, stacks, [[-1.0, 1.0]])
 
-    Parallax, clouds and objects that move by themselves cause it, roll and zoom do not. Arguments as in
-    ``_rms_of_contrasts``.
-    """
+
+def uneven_motion(gradients: list[RowGradients], stacks: int) -> Array:
+    """(B, 2) px, part of the displacements of quarters of the rows that roll and zoom cannot cause; without noise."""
     quadratic, cubic = [0.5, -0.5, -0.5, 0.5], [value / math.sqrt(20) for value in (-1.0, 3.0, -3.0, 1.0)]
-    return _rms_of_contrasts(gradients, stacks, rows, [quadratic, cubic])
+    return _rms_of_contrasts(gradients, stacks, [quadratic, cubic])
 
 
-def _rms_of_contrasts(gradients: list[RowGradients], stacks: int, rows: int, weights: list[list[float]]) -> Array:
+def _rms_of_contrasts(gradients: list[RowGradients], stacks: int, weights: list[list[float]]) -> Array:
     """(B, 2) px, root of the trimmed mean of the sum of squared contrasts between the parts of the rows; without noise.
 
-    The gradients are those of all groups of B ``stacks``; sums are taken over ``rows`` rows. The weights of each
-    contrast are those of the parts. Noise also scatters the mean, of which two standard deviations are subtracted: of
-    48 axes of pairs of 192 rows with noise of 0.025, 11 seemed to roll.
+    The gradients are those of all groups of B ``stacks``. The weights of each contrast are those of the parts. Noise
+    also scatters the mean, of which two standard deviations are subtracted: of 48 axes of pairs of 192 rows with noise
+    of 0.025, 11 seemed to roll.
     """
     found = []
     for of_group in gradients:
-        residual, noise, regular = displacements_of_parts(of_group, rows, len(weights[0]))
+        residual, noise, regular = displacements_of_parts(of_group, len(weights[0]))
         contrasts = residual.new_tensor(weights)
         variance = contrasts.square() @ noise
         excess = ((contrasts @ residual).square() - variance).sum(2)
@@ -429,14 +345,12 @@ def _rms_of_contrasts(gradients: list[RowGradients], stacks: int, rows: int, wei
     return np.sqrt(np.maximum(excess_of_stacks - 2 * np.sqrt(variance_of_stacks / count), 0.0))
 
 
-def displacements_of_parts(gradients: RowGradients, rows: int, parts: int = 4) -> tuple[Tensor, Tensor, Tensor]:
-    """Residual displacements of 2 or 4 parts of the rows from first to last frame, from sums over ``rows`` rows.
+def displacements_of_parts(gradients: RowGradients, parts: int = 4) -> tuple[Tensor, Tensor, Tensor]:
+    """Displacements (B, N, parts, 2) in px of parts of the rows from first to last frame, from sums over 64 rows.
 
-    Returns:
-        The differences of the displacements (B, N, parts, 2) in px, the variance of their noise, and (B, N) whether all
-        parts have structure along both directions.
+    Also the variance of their noise, and (B, N) whether all parts have structure along both directions.
     """
-    sums = gradients.quarters.unflatten(2, (parts, -1)).sum(3)
+    sums, rows = gradients.quarters.unflatten(2, (parts, -1)).sum(3), _SUMMED_ROWS
     count = sums.shape[1] // rows * rows
     weight = torch.where(gradients.variance > 0, 1 / gradients.variance.clamp(min=1e-300), 0.0)[:, :count, None, None]
     hxx, hxy, hyy, bx, by = (sums[:, :count] * weight).unflatten(1, (-1, rows)).sum(2).unbind(-1)
@@ -451,23 +365,22 @@ def displacements_of_parts(gradients: RowGradients, rows: int, parts: int = 4) -
 # Contradictions of the exposure time
 
 _SCATTER_ROWS = 32  # px, rows whose errors of interpolation count as one
+_LOWEST, _HIGHEST = 1 / 64, 0.15  # cycles/px; shading lies below, and a blur of 2 px is expanded to 20 % above
 
 
-def blur_ratio(
-    groups: list[FrameGroups], timing: RowTiming, motion: Motion, *, block: int = 2, highest: float = 0.15
-) -> tuple[Tensor, Tensor, Tensor]:
+def blur_ratio(groups: list[FrameGroups], timing: RowTiming, motion: Motion) -> Tensor:
     """Difference of the blur of neighbouring frames, relative to that of the exposure time and the motion.
 
     An exposure blurs a row to second order by ``1 + M : grad grad / 2`` with the second moments M of the path. The
     difference of two warped frames is fitted by ``ratio (M_2 - M_1) : grad grad m / 2 + gain m``, m their mean. The
     offsets determine the motion, so that ``ratio = (T_e / stated T_e)^2`` for slow tones. Only coarse detail is
-    compared, along and across rows: interpolation errors of fine detail increase the ratio. Three blocks of ``block``
-    rows are averaged with the weights 1/4, 1/2, 1/4; ``highest`` is in cycles/px along rows, below which the expansion
-    is used; a blur of 2 px is then expanded to 20 %.
+    compared, along and across rows: interpolation errors of fine detail increase the ratio. Three blocks of two rows
+    are averaged with the weights 1/4, 1/2, 1/4.
 
     Returns:
-        (B,) each: ratio, its standard deviation, and the size of the expected difference relative to m.
+        (B, 3): ratio, its standard deviation, and the size of the expected difference relative to m.
     """
+    block = 2
     parts: list[Tensor] = []
     counts: list[Tensor] = []
     for group in groups:
@@ -475,7 +388,7 @@ def blur_ratio(
         of_groups = group.motion_of_groups(motion)
         positions = Positions.of(group.starts_of_groups, group.spectra.height, timing, of_groups)
         u = group.spectra.frequencies
-        low = slice(int((u <= 1 / 64).sum()), int((u < highest).sum()))  # shading affects frequencies below 1/64
+        low = slice(int((u <= _LOWEST).sum()), int((u < _HIGHEST).sum()))
         low_spectra = group.spectra.band(low).in_groups(group.count)
 
         def averaged(values: Tensor) -> Tensor:
@@ -484,7 +397,7 @@ def blur_ratio(
             return 0.5 * of_blocks[:, :, 1:-1] + 0.25 * (of_blocks[:, :, :-2] + of_blocks[:, :, 2:])
 
         spectra = averaged(low_spectra.warped(positions.rows, positions.shift))
-        moments = averaged(second_moments(positions.exposure_starts, timing, of_groups))
+        second = averaged(moments(*exposure_paths(positions.exposure_starts, timing, of_groups), 2))
         visible = averaged(positions.visible(group.spectra.height, BLOCK_ROWS))
         both = (visible[:, 1:] * visible[:, :-1] == 1).double()
         mean, difference = 0.5 * (spectra[:, 1:] + spectra[:, :-1]), spectra[:, 1:] - spectra[:, :-1]
@@ -496,7 +409,7 @@ def blur_ratio(
         by_x = (2j * math.pi * u[low]).to(mean.dtype)
         by_y = 8 / 12 * (below - above) - 1 / 12 * (below_2 - above_2)
         by_yy = 16 / 12 * (below + above) - 1 / 12 * (below_2 + above_2) - 30 / 12 * here
-        change = (0.5 * (moments[:, 1:] - moments[:, :-1]))[:, :, 2:-2, None].to(by_x.dtype)
+        change = (0.5 * (second[:, 1:] - second[:, :-1]))[:, :, 2:-2, None].to(by_x.dtype)
         expected = (change[..., 0, 0] * by_x.square()) * here
         expected += (2 * change[..., 0, 1] / block * by_x) * by_y
         expected += (change[..., 1, 1] / block**2) * by_yy
@@ -523,4 +436,4 @@ def blur_ratio(
     variance = 8 / 3 * inverse[:, 0, 0] * (square - (solution * right).sum(-1)).clamp(min=0.0) / count
     scores = products[:, :, :2, 2] - (products[:, :, :2, :2] @ solution[:, None, :, None])[..., 0]
     scatter = (scores @ inverse[:, 0, :, None]).square().sum((1, 2))
-    return solution[:, 0], torch.maximum(variance, scatter).sqrt(), scale[:, 0] / scale[:, 1]
+    return torch.stack([solution[:, 0], torch.maximum(variance, scatter).sqrt(), scale[:, 0] / scale[:, 1]], -1)

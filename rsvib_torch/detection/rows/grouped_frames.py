@@ -5,7 +5,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md), in e
 
 import math
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 import torch
@@ -14,13 +14,14 @@ from torch import Tensor
 from rsvib_torch.detection.measurements import Measurements, trimmed_mean
 from rsvib_torch.detection.rows.displacements import (
     FrameGroups,
+    MeasuredGroup,
     blur_ratio,
     column_pattern_of,
     differential_motion,
     displacements_of_parts,
     frame_groups,
     joined_groups,
-    measure_groups,
+    measure_group,
     measure_strips,
     stack_spectra,
     uneven_motion,
@@ -60,11 +61,8 @@ class MeasuredRows:
         for part in self.gradients:
             of_groups = np.arange(len(part.variance)).reshape(self.num_stacks, -1)[stacks].ravel()
             gradients.append(part.stacks(tensor(of_groups).to(part.variance.device)))
-        return MeasuredRows(
-            take_stacks([self.measurements], stacks),
-            gradients,
-            None if self.apart is None else self.apart[stacks],
-        )
+        apart = None if self.apart is None else self.apart[stacks]
+        return MeasuredRows(take_stacks([self.measurements], stacks), gradients, apart)
 
     def differential(self) -> Array:
         """(B, 2) px, rms difference of the displacements along a row that the components do not explain."""
@@ -91,16 +89,31 @@ class GroupedFrames:
     groups: list[FrameGroups]  # the frames
     timing: RowTiming  # the sensor, in row order
 
+    unit: ClassVar[str] = "groups"  # of the progress
+
     def measure(
-        self,
-        motion: Vibration | FreeMotion,
-        gradients: list[RowGradients] | None = None,
-        *,
-        keep_images: bool = True,
+        self, motion: Vibration | FreeMotion, gradients: list[RowGradients] | None = None, *, keep_images: bool = True
     ) -> MeasuredRows:
-        """Measurements around a motion, see ``measure_groups``."""
-        view = self.view(motion)
-        return MeasuredRows(*measure_groups(self.groups, self.timing, view, gradients, keep_images=keep_images))
+        """All groups measured around a motion, as one record; ``keep_images`` for further rounds."""
+        known = [None] * len(self.groups) if gradients is None else gradients
+        count, view = sum(group.count for group in self.groups), self.view(motion)
+        parts, found, advance = [], [], steps(count, self.unit)
+        for group, of_group in zip(self.groups, known, strict=True):
+            part, of_part = self.measure_group(group, motion, view, of_group)
+            parts.append(part)
+            found.append(of_part if keep_images else of_part.without_images())
+            advance(group.count)
+        return MeasuredRows(joined_groups(parts, self.timing.exposure_time, count), found, self.apart(found))
+
+    def measure_group(
+        self, group: FrameGroups, motion: Motion, view: Motion, gradients: RowGradients | None
+    ) -> tuple[MeasuredGroup, RowGradients]:
+        """``displacements.measure_group`` around a motion, which the measured stacks have the ``view`` of."""
+        return measure_group(group, self.timing, view, gradients)
+
+    def apart(self, gradients: list[RowGradients]) -> Array | None:
+        """``MeasuredRows.apart``."""
+        return None
 
     def view(self, motion: Vibration | FreeMotion) -> Motion:
         """The motion of the stacks that are measured, with two components."""
@@ -128,27 +141,35 @@ class GroupedFrames:
 
     def blur_ratio(self, motion: Vibration) -> Tensor:
         """(B, 3) ratio, standard deviation and size as in ``displacements.blur_ratio``."""
-        return torch.stack(blur_ratio(self.groups, self.timing, self.view(motion)), -1)
+        return blur_ratio(self.groups, self.timing, self.view(motion))
 
     def differently_blurred(self, motion: Vibration) -> Array:
         """Whether the frames of any group of each stack are blurred differently, (B,) bool, as in ``warping``."""
         view, height = self.view(motion), self.groups[0].spectra.height
-        of_groups = [
+        different = [
             differently_blurred(group.starts_of_groups, height, self.timing, group.motion_of_groups(view))[0]
             for group in self.groups
         ]
-        return table(torch.cat([part.unflatten(0, (len(motion.amplitude), -1)) for part in of_groups], 1).any(1))
+        return table(torch.cat([part.unflatten(0, (len(motion.amplitude), -1)) for part in different], 1).any(1))
 
 
-def grouped_frames(frames: Tensor, valid: Tensor | None, timing: RowTiming, motion: Vibration) -> GroupedFrames:
-    """Frames (B, T, H, W) in groups for a motion of two components, of which a first estimate is given."""
-    spectra = stack_spectra(frames, valid)
-    return GroupedFrames(frame_groups(spectra, timing, motion, pairs="very different"), timing)
+def grouped_frames(
+    frames: Tensor, valid: Tensor | None, timing: RowTiming, motion: Vibration | FreeMotion
+) -> GroupedFrames:
+    """Frames (B, T, H, W) in groups for a motion of two components, of which a first estimate is given.
+
+    Pairs, whose blur can be equalised, are enough for tones; a free motion needs all frames that contain a row.
+    """
+    pairs: Literal["never", "very different"] = "never" if isinstance(motion, FreeMotion) else "very different"
+    return GroupedFrames(frame_groups(stack_spectra(frames, valid), timing, motion, pairs=pairs), timing)
 
 
 # Strips
 
 _MAX_SLIDE_OF_BLUR = 0.15  # px
+# px, difference of the displacements by roll and zoom of two neighbouring strips: the second order of their
+# interpolation blurs as an exposure with a path of this length; and their distance: narrower ones are margins mostly
+_MAX_SLIDE, _MIN_PITCH = 0.1, 48
 
 
 def _in_rad(motion: Vibration | FreeMotion, scale: FieldScale) -> Vibration | FreeMotion:
@@ -166,30 +187,19 @@ class GroupedStrips(GroupedFrames):
     num_frames: int  # frames of a stack
     slide: float  # px, difference of the displacements of the middle of a strip and its ends
 
-    def measure(
-        self,
-        motion: Vibration | FreeMotion,
-        gradients: list[RowGradients] | None = None,
-        *,
-        keep_images: bool = True,
-    ) -> MeasuredRows:
-        """Components of the motion of every row (B, N, G, A)."""
-        known = [None] * len(self.groups) if gradients is None else gradients
-        view, measured, advance = self.view(motion), [], steps(len(self.groups), "groups of strips")
-        for group, of_group in zip(self.groups, known, strict=True):
-            factors = self.scale.factors
-            part, of_part = measure_strips(group, self.timing, motion, view, self.strips, factors, of_group)
-            measured.append((part, of_part if keep_images else of_part.without_images()))
-            advance()
-        gradients = [of_group for _, of_group in measured]
-        measurements = joined_groups([part for part, _ in measured], self.timing.exposure_time, len(self.groups))
-        return MeasuredRows(measurements, gradients, self._apart(gradients))
+    unit: ClassVar[str] = "groups of strips"
 
-    def _apart(self, gradients: list[RowGradients], *, rows: int = 64) -> Array:
-        """``MeasuredRows.apart``, from sums over parts of ``rows`` rows."""
+    def measure_group(
+        self, group: FrameGroups, motion: Motion, view: Motion, gradients: RowGradients | None
+    ) -> tuple[MeasuredGroup, RowGradients]:
+        """Components (B, N, G, A) of the motion of the rows of a group."""
+        return measure_strips(group, self.timing, motion, view, self.strips, self.scale.factors, gradients)
+
+    def apart(self, gradients: list[RowGradients]) -> Array:
+        """``MeasuredRows.apart``."""
         excesses = []
         for of_group in gradients:
-            residual, noise, regular = displacements_of_parts(of_group, rows)
+            residual, noise, regular = displacements_of_parts(of_group)
             share = 1 - 0.5 * self.scale.axes / residual.shape[2]  # the fit of the components takes part of both
             excess = 0.5 * (residual.square() - share * noise).mean(2) / share
             excesses.append(torch.where(regular[..., None], excess, torch.nan))
@@ -237,16 +247,8 @@ def grouped_strips(
     scale: FieldScale,
     *,
     pairs: bool = True,
-    max_slide: float = 0.1,
-    min_pitch: int = 48,
 ) -> GroupedStrips:
-    """Frames (B, T, H, W) in strips of columns, for a motion of which all components are in px.
-
-    ``pairs``: form pairs if the frames are blurred differently. ``max_slide`` is the difference in px of the
-    displacements by roll and zoom of two neighbouring strips; the second order of their interpolation blurs as an
-    exposure with a path of this length. ``min_pitch`` are the columns from the middle of a strip to that of the next;
-    narrower strips consist of margins mostly.
-    """
+    """Frames (B, T, H, W) in strips of columns, for a motion in px; in ``pairs`` if they are blurred differently."""
     field, count = _in_rad(motion, scale), frames.shape[1]
     starts = timing.row_starts(count, scale.height, frames.device)[:, :: max(1, scale.height // 64)].flatten()
     ends = 0.5 * scale.width * torch.tensor([-1.0, 1.0], dtype=torch.float64, device=frames.device)
@@ -256,7 +258,7 @@ def grouped_strips(
     margin = math.ceil(float(along.abs().amax()) + 1.0) + MARGIN  # 1 px: whole pixels of an image motion
     reached = field.largest_displacement(float(starts[0]), float(starts[-1]))
     slope = float(largest_slope(reached, scale.width, scale.height, scale.camera).amax())
-    strips = ColumnStrips.between_ends(scale.width, max(min_pitch, max_slide / max(slope, 1e-9)), margin)
+    strips = ColumnStrips.between_ends(scale.width, max(_MIN_PITCH, _MAX_SLIDE / max(slope, 1e-9)), margin)
     spectra = stack_spectra(frames, valid, strips)
     columns = strips.columns.to(frames.device)
     view = ColumnMotion.of_columns(field, columns, timing, count, scale.height)

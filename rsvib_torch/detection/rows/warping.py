@@ -37,11 +37,7 @@ class Positions:
 
     @classmethod
     def of(cls, starts: Tensor, height: int, timing: RowTiming, motion: Motion, step: int = 1) -> "Positions":
-        """Positions of every ``step``-th row of the scene that the middle of a group contains.
-
-        ``starts`` (B, G) are the exposure starts in s of the first rows of the frames, ``motion`` is that of each
-        group.
-        """
+        """Positions of every ``step``-th scene row that the middle of a group of frames contains."""
         rows = torch.arange(0, height, step, dtype=torch.float64, device=starts.device)
         # an image motion carries the group away from the first frame: rows and columns follow it by whole pixels
         middle = starts.mean(-1, keepdim=True) + 0.5 * height * timing.row_time
@@ -71,7 +67,7 @@ class Positions:
 # Blur of exposures
 
 
-def _paths(exposure_starts: Tensor, timing: RowTiming, motion: Motion) -> tuple[Tensor, Tensor]:
+def exposure_paths(exposure_starts: Tensor, timing: RowTiming, motion: Motion) -> tuple[Tensor, Tensor]:
     """Paths (B, G, S, N, 2) in px about their means during exposures from ``exposure_starts``, and weights (N,)."""
     # half of the nodes of the restoration: images are blurred twice, and amplitudes of seven recordings are the same to
     # 1e-5 px as with two thirds
@@ -81,13 +77,8 @@ def _paths(exposure_starts: Tensor, timing: RowTiming, motion: Motion) -> tuple[
     return path - (path * weights[:, None]).sum(-2, keepdim=True), weights
 
 
-def second_moments(exposure_starts: Tensor, timing: RowTiming, motion: Motion) -> Tensor:
-    """Second moments (B, G, S, 2, 2) in px^2 of the paths during exposures from ``exposure_starts`` (B, G, S) in s."""
-    return _moments(*_paths(exposure_starts, timing, motion), 2)
-
-
-def _moments(paths: Tensor, weights: Tensor, order: int) -> Tensor:
-    """Moments (B, G, S, 2, ...) of an order in px^order of paths from ``_paths``."""
+def moments(paths: Tensor, weights: Tensor, order: int) -> Tensor:
+    """Moments (B, G, S, 2, ...) of an order in px^order of ``exposure_paths``."""
     powers = weights[:, None] * paths
     for axes in range(1, order):  # products with the path along a further axis
         powers = powers[..., None] * paths[(..., *[None] * axes, slice(None))]
@@ -103,17 +94,14 @@ _NEARLY_EQUAL = (math.inf, 0.1, 0.008)
 
 
 def differently_blurred(starts: Tensor, height: int, timing: RowTiming, motion: Motion) -> tuple[Tensor, Tensor]:
-    """Whether frames of ``height`` rows that start at ``starts`` (B, G) in s are blurred differently, two bool (B,).
-
-    The second states whether they are blurred so differently that only the blur of two frames can be equalised.
-    """
+    """(B,) bool each, whether frames from ``starts`` (B, G) on are blurred differently, and only pairs equalise it."""
     rows = torch.arange(0, height, 8, dtype=torch.float64, device=starts.device)
-    return _differences(*_paths(starts[..., None] + rows * timing.row_time, timing, motion))
+    return _differences(*exposure_paths(starts[..., None] + rows * timing.row_time, timing, motion))
 
 
 def _differences(paths: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """``differently_blurred`` of paths from ``_paths``."""
-    orders = [values.flatten(3) for values in (paths, _moments(paths, weights, 2), _moments(paths, weights, 3))]
+    """``differently_blurred`` of paths from ``exposure_paths``."""
+    orders = [values.flatten(3) for values in (paths, moments(paths, weights, 2), moments(paths, weights, 3))]
     values = torch.cat(orders, -1)
     ranges = (values.amax(1) - values.amin(1)).amax(1)
     sizes = [of_order.shape[-1] for of_order in orders]
@@ -128,8 +116,8 @@ def _differences(paths: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
 def _between_rows(positions: Positions, timing: RowTiming, motion: Motion, away: Tensor) -> tuple[Tensor, Tensor]:
     """Frame rows and shifts (B, G, S, N) of scene rows that are ``away`` (B, G, S, N) px from every scene row.
 
-    They are interpolated between whole scene rows by cubic polynomials, with an error of 1e-5 px for 3 px and periods
-    of 60 rows. To solve for them takes a tenth to a third of the time of a detection behind long exposures.
+    Cubic interpolation between whole scene rows has an error of 1e-5 px for 3 px and periods of 60 rows. To solve for
+    them takes a tenth to a third of the time of a detection behind long exposures.
     """
     height = positions.scene_rows.shape[-1]
     away = away.clamp(-height, height)  # the path of a fit that diverges may have any length
@@ -154,18 +142,8 @@ def _between_rows(positions: Positions, timing: RowTiming, motion: Motion, away:
 def warp_to_scene(
     spectra: RowSpectra, positions: Positions, timing: RowTiming, motion: Motion
 ) -> Callable[[slice], Tensor]:
-    """Function that warps the frames of groups to some of the scene rows, with equal blur.
-
-    Args:
-        spectra: Spectra of the frames of each group.
-        positions: Where the frames contain the scene rows.
-        timing: The sensor, in row order.
-        motion: Motion of each group (B).
-
-    Returns:
-        Function from a slice of the scene rows to warped spectra (B, G, s, U).
-    """
-    paths, weights = _paths(positions.exposure_starts, timing, motion)
+    """Function that warps frames of groups (B, G) to a slice of the scene rows (B, G, s, U), with equal blur."""
+    paths, weights = exposure_paths(positions.exposure_starts, timing, motion)
     different, very_different = _differences(paths[:, :, ::8], weights)
     if not bool(different.any()):
         return lambda part: spectra.warped(positions.rows[..., part], positions.shift[..., part])
@@ -183,8 +161,8 @@ def _warp_with_mean_moments(
     A frame is ``f = (1 + M_2 : grad grad / 2 - M_3 : grad grad grad / 6) s`` of the scene s, to third order, with the
     moments M of its path. The difference of the moments from their means over the group is added.
     """
-    by_x = _derivative_along_rows(spectra)
-    of_second, of_third = _moments(paths, weights, 2), _moments(paths, weights, 3)
+    by_x = (2j * math.pi * spectra.frequencies).to(spectra.values.dtype)
+    of_second, of_third = moments(paths, weights, 2), moments(paths, weights, 3)
     second = (of_second.mean(1, keepdim=True) - of_second) / 2
     third = (of_third - of_third.mean(1, keepdim=True)) / 6
     # the derivatives of a frame contain those of its moments, which change from row to row: to third order along y
@@ -193,10 +171,10 @@ def _warp_with_mean_moments(
     second, third = (values[..., None, None].to(by_x.real) for values in (second, third))
 
     def warped(part: slice) -> Tensor:
-        index = _with_neighbours(part, positions, _FILTERS)
+        index = _with_neighbours(part, positions, _REACH)
         images = spectra.warped(positions.rows[..., index], positions.shift[..., index])
         by_y, by_yy, by_yyy = _across_rows(torch.view_as_real(images), _FILTERS)
-        images = _inner(images, _FILTERS)
+        images = images[:, :, _REACH:-_REACH]
         here = torch.view_as_real(images)
         xx, xy, yy = (second[:, :, part, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
         xxx, xxy, xyy, yyy = (third[:, :, part, i, j, k] for i, j, k in ((0, 0, 0), (0, 0, 1), (0, 1, 1), (1, 1, 1)))
@@ -222,15 +200,15 @@ def _warp_along_paths(
     second moments M of the path that differ by ``y dM/ds`` to first order, which displaces detail by 0.01 px. Each node
     of the path is therefore corrected by ``y / 2 dM/ds`` times second derivatives of the image.
     """
-    by_x = _derivative_along_rows(spectra)
-    slope = torch.gradient(_moments(paths, weights, 2), dim=2)[0][..., None, None].to(by_x.real) / 2
+    by_x = (2j * math.pi * spectra.frequencies).to(spectra.values.dtype)
+    slope = torch.gradient(moments(paths, weights, 2), dim=2)[0][..., None, None].to(by_x.real) / 2
     x, y = paths.flip(1).unbind(-1)  # of the other frame
     node_rows, node_shift = _between_rows(positions, timing, motion, -y)
     node_rows, node_shift = node_rows.movedim(-1, 0), (node_shift - x).movedim(-1, 0)  # (N, B, G, S)
     factors = torch.stack([weights.expand_as(y), weights * y]).to(by_x.real).movedim(-1, 0)[..., None, None]
 
     def warped(part: slice) -> Tensor:
-        index = _with_neighbours(part, positions, _SHORT_FILTERS)
+        index = _with_neighbours(part, positions, _SHORT_REACH)
         totals = by_x.new_zeros(2, *positions.rows.shape[:2], len(index), len(by_x))
         of_numbers = torch.view_as_real(totals)
         copies = spectra.warped_copies(node_rows[..., index], node_shift[..., index])
@@ -239,32 +217,22 @@ def _warp_along_paths(
         mean, moment = totals  # of the copies, and of y times them
         by_y, by_yy = _across_rows(torch.view_as_real(moment), _SHORT_FILTERS)
         xx, xy, yy = (slope[:, :, part, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
-        total = _inner(moment, _SHORT_FILTERS) * by_x
+        inner = slice(_SHORT_REACH, -_SHORT_REACH)
+        total = moment[:, :, inner] * by_x
         numbers = torch.view_as_real(total)
         numbers.mul_(xx).addcmul_(by_y, xy, value=2)
-        total.mul_(by_x).add_(_inner(mean, _SHORT_FILTERS))
+        total.mul_(by_x).add_(mean[:, :, inner])
         numbers.addcmul_(by_yy, yy)
         return total
 
     return warped
 
 
-def _derivative_along_rows(spectra: RowSpectra) -> Tensor:
-    """(U,) factors of spectra."""
-    return (2j * math.pi * spectra.frequencies).to(spectra.values.dtype)
-
-
-def _with_neighbours(part: slice, positions: Positions, filters: Array) -> Tensor:
-    """Indices of scene rows, with the neighbours of the first and of the last that filters use."""
-    count, reach = positions.rows.shape[-1], filters.shape[1] // 2
+def _with_neighbours(part: slice, positions: Positions, reach: int) -> Tensor:
+    """Indices of scene rows, with the neighbours of the first and of the last within reach."""
+    count = positions.rows.shape[-1]
     first, last, _ = part.indices(count)
     return torch.arange(first - reach, last + reach, device=positions.rows.device).clamp_(0, count - 1)
-
-
-def _inner(images: Tensor, filters: Array) -> Tensor:
-    """Images (B, G, s + R - 1, ...) without the neighbours that filters (K, R) use."""
-    reach = filters.shape[1] // 2
-    return images[:, :, reach : images.shape[2] - reach]
 
 
 def _derivative_filters(reach: int) -> Array:
@@ -284,7 +252,8 @@ def _derivative_filters(reach: int) -> Array:
     return np.stack(filters)
 
 
-_FILTERS = _derivative_filters(5)
+_REACH, _SHORT_REACH = 5, 2  # rows to either side
+_FILTERS = _derivative_filters(_REACH)
 # differences of fourth order: enough for corrections, and each run of rows has fewer neighbours
 _SHORT_FILTERS = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-1.0, 16.0, -30.0, 16.0, -1.0]]) / 12
 

@@ -19,8 +19,13 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.rows.displacements import frame_groups, stack_spectra
-from rsvib_torch.detection.rows.grouped_frames import GroupedFrames, GroupedStrips, MeasuredRows, grouped_strips
+from rsvib_torch.detection.rows.grouped_frames import (
+    GroupedFrames,
+    GroupedStrips,
+    MeasuredRows,
+    grouped_frames,
+    grouped_strips,
+)
 from rsvib_torch.detection.sensitivity import displacements_by_row_time
 from rsvib_torch.detection.start import band_curve, measurements_of_curve
 from rsvib_torch.detection.strips import FieldScale, camera_in_row_order
@@ -30,11 +35,7 @@ from rsvib_torch.execution.parallel import threads_for
 from rsvib_torch.execution.precision import full_precision, without_gradients
 from rsvib_torch.frames.entry_points import frames_options
 from rsvib_torch.frames.grey import GreyFrames, grey_frames
-from rsvib_torch.frames.orientation import (
-    findings_from_row_order,
-    magnitudes_from_row_order,
-    offsets_from_row_order,
-)
+from rsvib_torch.frames.orientation import findings_from_row_order, magnitudes_from_row_order, offsets_from_row_order
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.field import ColumnMotion
 from rsvib_torch.motion.motion import Motion
@@ -171,45 +172,38 @@ def detect_motion(frames: FramesOrFiles, timing: SensorTiming, options: FreeMoti
     camera = camera_in_row_order(options, (height, width), timing)
     scale = FieldScale(axes, width, height, camera)
     with threads_for(stacks.images):
-        results = [
-            _detect(stacks.one(i), timing, options, options.knot_rows, options.iterations, scale)
-            for i in range(len(stacks.images))
-        ]
+        results = [_detect(stacks.one(index), timing, options, scale) for index in range(len(stacks.images))]
     return MotionDetection.stacked(results) if stacks.batched else results[0]
 
 
-def _detect(
-    stack: GreyFrames,
-    timing: SensorTiming,
-    bands: RegistrationOptions,
-    knot_rows: int,
-    iterations: int,
-    scale: FieldScale,
-) -> MotionDetection:
+def _detect(stack: GreyFrames, timing: SensorTiming, options: FreeMotionOptions, scale: FieldScale) -> MotionDetection:
     """``detect_motion`` of one stack."""
-    rowwise, curve, record = start_curve(stack, timing, bands)
-    longest = math.floor((record[1] - record[0]) / rowwise.row_time)
+    # 1. The rows, measured around a spline, and their weights.
+    rowwise, curve, record = start_curve(stack, timing, options)
+    longest, knot_rows = math.floor((record[1] - record[0]) / rowwise.row_time), options.knot_rows
     if knot_rows > longest:
         raise ValueError(f"knot_rows must be at most {longest}, the row times of the stack, got {knot_rows}")
-    rows, motion, spacing = measure_freely(stack, rowwise, curve, record, bands, knot_rows, iterations)
+    rows, motion, spacing = measure_freely(stack, rowwise, curve, record, options, knot_rows, options.iterations)
     if not scale.same_for_all_columns:
-        rows, motion = _measure_field(stack, rowwise, motion, spacing, record, scale, iterations)
+        rows, motion = _measure_field(stack, rowwise, motion, spacing, record, scale, options.iterations)
     measured = rows.measurements
     residual = residual_of_motion(measured, motion[0])
     weighed = measured.reweighted(residual)
     share = weighed.independent_fraction(residual) * measured.share_counted(residual)
+    weighed = replace(weighed, independent=share)
+    # 2. The last fit, with its uncertainty at the middles of exposures of up to 32 rows of each frame.
     starts = rowwise.frame_starts(stack.images.shape[1])
-    count = min(32, scale.height)
-    rows_of_report = torch.linspace(0, scale.height - 1, count, dtype=torch.float64, device=starts.device)
-    times = starts[:, None] + rows_of_report * rowwise.row_time + 0.5 * rowwise.exposure_time
-    fit = _fit_spline(replace(weighed, independent=share), spacing, record, table(times).ravel())
+    rows_of_report = np.linspace(0, scale.height - 1, min(32, scale.height))
+    times = starts[:, None] + tensor(rows_of_report) * rowwise.row_time + 0.5 * rowwise.exposure_time
+    fit = _fit_spline(weighed, spacing, record, table(times).ravel())
     if rowwise.row_time_std:
         by_row_time = displacements_by_row_time(measured, motion[0], rowwise, len(starts))
-        changed = replace(weighed, displacements=weighed.displacements + by_row_time, independent=share)
+        changed = replace(weighed, displacements=weighed.displacements + by_row_time)
         other = _fit_spline(changed, spacing, record, table(times).ravel())
         fit = replace(fit, by_row_time=other.coefficients - fit.coefficients)
     motion = _motion(fit, (0.25 * scale.width, 0.25 * scale.height))  # px; beyond, frames share too little
-    banded = measurements_of_curve(curve, rowwise, bands.band_step)
+    # 3. The row bands, which may contradict the motion of the middle column.
+    banded = measurements_of_curve(curve, rowwise, options.band_step)
     of_middle: Motion = motion
     if not scale.same_for_all_columns:
         middle = torch.zeros(1, dtype=torch.float64, device="cpu")
@@ -254,10 +248,7 @@ def _rounds(
     *,
     weighted: bool = False,
 ) -> tuple[MeasuredRows, FreeMotion]:
-    """Rounds of measuring the rows of one stack around a spline and fitting the spline to them.
-
-    ``weighted`` gives objects that move by themselves less weight in the first round already.
-    """
+    """Rounds of measuring the rows of one stack around a spline and fitting it to them, ``weighted`` in all of them."""
     for number in range(count):
         measured = rows.measure(motion.to(rows.groups[0].starts.device), keep_images=False)
         measurements = measured.measurements
@@ -277,17 +268,11 @@ def measure_freely(
     knot_rows: int,
     iterations: int,
 ) -> tuple[MeasuredRows, FreeMotion, float]:
-    """Displacements of the rows of one stack, measured around a spline that is fitted to them again in every round.
-
-    The result has the measurements, the motion (a batch of one), and its knot spacing in seconds.
-    """
+    """The rows of one stack around a spline, the spline (a batch of one), and its knot spacing in seconds."""
     spacing = max(knot_rows * timing.row_time, (record[1] - record[0]) / 3000)  # the cost grows with knots^3
-    measured = measurements_of_curve(curve, timing, bands.band_step)
-    fit = _fit_spline(measured, max(spacing, 0.5 * bands.band_rows * timing.row_time), record)
-    motion = _motion(fit)
-    rows = GroupedFrames(
-        frame_groups(stack_spectra(stack.images, stack.valid), timing, motion.to(stack.images.device)), timing
-    )
+    banded = measurements_of_curve(curve, timing, bands.band_step)
+    motion = _motion(_fit_spline(banded, max(spacing, 0.5 * bands.band_rows * timing.row_time), record))
+    rows = grouped_frames(stack.images, stack.valid, timing, motion.to(stack.images.device))
     return *_rounds(rows, motion, spacing, record, iterations), spacing
 
 
@@ -296,8 +281,7 @@ def start_curve(
 ) -> tuple[RowTiming, OffsetCurve, tuple[float, float]]:
     """Timing in row order, the offsets of the row bands of one stack, start and end of the record in seconds.
 
-    Raises:
-        ValueError: If the frames do not fit the timing, or fewer than a quarter of the bands are found.
+    An error if the frames do not fit the timing, or fewer than a quarter of the bands are found.
     """
     frames = stack.images
     rowwise = timing.in_row_order()
@@ -331,14 +315,11 @@ def _moved(measured: Measurements, motion: Motion) -> Array:
     return table(motion.mean_displacement(tensor(measured.exposure_starts), measured.exposure_time))
 
 
-def band_errors(banded: Measurements, motion: Motion, *, counted: float = 0.75) -> list[float]:
-    """Mean difference in px of the offsets of the row bands of one stack from a motion in row order, for each axis.
-
-    The best bands count, a fraction ``counted``: clouds may cover the others.
-    """
+def band_errors(banded: Measurements, motion: Motion) -> list[float]:
+    """Mean difference in px of the offsets of the row bands of one stack from a motion in row order, for each axis."""
     rest = _offsets_of_bands(banded, residual_of_motion(banded, motion))
-    errors: list[float] = np.sort(np.abs(rest), 0)[: math.ceil(counted * len(rest))].mean(0).tolist()
-    return errors
+    best = np.sort(np.abs(rest), 0)[: math.ceil(0.75 * len(rest))]  # clouds may cover the others
+    return best.mean(0).tolist()
 
 
 def _offsets_of_bands(banded: Measurements, displacements: Array) -> Array:
@@ -401,10 +382,7 @@ class _SplineFit:
         return self.start + (np.arange(self.coefficients.shape[-1]) - 1.0) * self.spacing
 
     def variances(self, index: Array, weights: Array) -> Array:
-        """Variances (S, F, A) of linear functions of coefficients ``index`` (S, M), at most ``step`` apart.
-
-        Their factors are ``weights`` (S, F, M); the sum of a function is 1 or 0.
-        """
+        """Variances (S, F, A) of sums of ``weights`` (S, F, M) times coefficients ``index`` (S, M)."""
         part = np.minimum(index.min(1) // self.step, len(self.covariances[0]) - 1)
         place = index - self.step * part[:, None]
         parts = [values[part[:, None, None], place[:, :, None], place[:, None]] for values in self.covariances]
@@ -426,37 +404,30 @@ def _fit_spline(
     spectrum of the motion is then estimated as well, for splines of up to 800 knots.
     """
     first, last = record
-    axes = measurements.displacements.shape[-1]
     count = math.ceil((last - first) / spacing) + 3
+    seen, exposure_time, mean = measurements.visible[0], measurements.exposure_time, None
+    if report_times is not None:
+        index, weights = spline_taps(report_times, first, spacing, count)
+        mean = np.bincount(index.ravel(), weights.ravel(), count) / len(report_times)
     coefficients, covariances, step = [], [], 1
-    for axis in range(axes):
-        band, right = _normal_equations(measurements, axis, first, spacing, count)
-        values = measurements.displacements[0, ..., axis] * measurements.visible[0]
-        energy = float((measurements.inverse_variances[0, :, axis, None] * np.square(values)).sum())
+    for axis in range(measurements.displacements.shape[-1]):
+        # 1. The coefficients that each displacement depends on, which is a mean over the exposure and a band.
+        average = measurements.average_times[min(axis, 1)] + exposure_time
+        nodes, shares = (table(values) for values in gauss_legendre(3 + math.ceil(2 * average / spacing)))
+        begin = measurements.exposure_starts[0] + 0.5 * (exposure_time - average)
+        index, weights = spline_taps(begin[..., None] + average * nodes, first, spacing, count)  # (R, G, Q, 4)
+        index, weights = index.reshape(*seen.shape, -1), (shares[:, None] * weights).reshape(*seen.shape, -1)
+        # 2. The normal equations.
+        values, of_rows = measurements.displacements[0, ..., axis] * seen, measurements.inverse_variances[0, :, axis]
+        weighted, energy = of_rows[:, None] * values, float((of_rows[:, None] * np.square(values)).sum())
+        right = np.bincount(index.ravel(), (weights * weighted[..., None]).ravel(), count)
+        (band,) = normal_bands(index, weights, seen, of_rows[None], count)
+        # 3. Their solution.
         known = max(float(measurements.num_measurements[0, axis]), 1.0)
-        mean = None
-        if report_times is not None:
-            index, weights = spline_taps(report_times, first, spacing, count)
-            mean = np.bincount(index.ravel(), weights.ravel(), count) / len(report_times)
         value, covariance, step = _solved_spline(band, right, energy, known, mean)
         coefficients.append(value - value.mean())
         covariances += [] if covariance is None else [covariance]
     return _SplineFit(np.stack(coefficients), first, spacing, covariances, step)
-
-
-def _normal_equations(
-    measurements: Measurements, axis: int, start: float, spacing: float, count: int
-) -> tuple[Array, Array]:
-    """Lower band (D, N) of the normal matrix of N = ``count`` coefficients of an axis, and its right side (N,)."""
-    seen, starts = measurements.visible[0], measurements.exposure_starts[0]
-    average = measurements.average_times[min(axis, 1)] + measurements.exposure_time
-    nodes, shares = (table(values) for values in gauss_legendre(3 + math.ceil(2 * average / spacing)))
-    times = starts[..., None] + 0.5 * (measurements.exposure_time - average) + average * nodes  # (R, G, Q)
-    index, weights = spline_taps(times, start, spacing, count)
-    index, weights = index.reshape(*seen.shape, -1), (shares[:, None] * weights).reshape(*seen.shape, -1)
-    weighted = measurements.inverse_variances[0, :, axis, None] * measurements.displacements[0, ..., axis] * seen
-    right = np.bincount(index.ravel(), (weights * weighted[..., None]).ravel(), count)
-    return normal_bands(index, weights, seen, measurements.inverse_variances[0, :, axis][None], count)[0], right
 
 
 def normal_bands(index: Array, weights: Array, seen: Array, row_weights: Array, count: int) -> Array:
@@ -490,7 +461,7 @@ def _solved_spline(
     """Coefficients (N,) of a smooth spline, their covariances and the step of these as in ``_SplineFit``.
 
     ``energy`` is the weighted sum of the squared displacements, of which ``known`` are independent; ``mean`` (N,) is a
-    function of the coefficients that has no variance, or None for no covariances.
+    function of the coefficients without variance, None for no covariances.
     """
     count = len(right)
     rounding = 1e-12 * energy  # error of the sums that make the residual energy
@@ -540,10 +511,7 @@ def _solved_spline(
 
 
 def _inverse_near_diagonal(band: Array) -> tuple[int, Array]:
-    """Parts (K, 2 B, 2 B) of the inverse of a matrix of lower band (B, N), from the row and column k B on, and B.
-
-    Blocks of B rows are eliminated from the last to the first; the inverse follows from the first to the last.
-    """
+    """B, and parts (K, 2 B, 2 B) of the inverse of a matrix of lower band (B, N), from the row and column k B on."""
     width, count = band.shape
     blocks = max(2, -(-count // width))
     whole = np.zeros((width, (blocks + 1) * width))
@@ -570,11 +538,10 @@ def _inverse_near_diagonal(band: Array) -> tuple[int, Array]:
 def _fit_with_spectrum(gram: Tensor, right: Tensor, noise: float, smoothness: float) -> tuple[Tensor, Tensor]:
     """Coefficients (N,) of a spline and their covariance (N, N), with the power of each frequency estimated.
 
-    The smoothness penalty assumes how fast the power of a motion falls with frequency. A motion with a resonance has
-    more power there, and may have more in undetermined components of similar frequency. The coefficients are a straight
-    line and cosines, ``c = sum_j a_j cos(w_j (n + 1/2))`` with a_j of variance s_j. Expectation maximisation alternates
-    between a for given s, and s_j = mean of ``a_j^2 + var(a_j)`` over neighbouring frequencies, relative to the
-    penalty.
+    A motion with a resonance has more power there than the smoothness penalty assumes, and may have more in
+    undetermined components of similar frequency. The coefficients are a straight line and cosines, ``c = sum_j a_j
+    cos(w_j (n + 1/2))`` with a_j of variance s_j. Expectation maximisation alternates between a for given s, and s_j =
+    mean of ``a_j^2 + var(a_j)`` over neighbouring frequencies, relative to the penalty.
 
     ``gram`` (N, N) and ``right`` (N,) are the normal equations, ``noise`` is the variance of measurements of unit
     weight, and ``smoothness`` the weight of squared second differences to start with.
@@ -582,8 +549,7 @@ def _fit_with_spectrum(gram: Tensor, right: Tensor, noise: float, smoothness: fl
     count = len(right)
     margin = max(10, count // 16)  # knots beyond the record, as cosines have zero slope at their ends
     length = count + 2 * margin
-    order = torch.arange(length, dtype=torch.float64, device=right.device)
-    place = torch.arange(count, dtype=torch.float64, device=right.device)
+    order, place = tensor(np.arange(float(length))), tensor(np.arange(float(count)))
     angle = math.pi / length * order
     waves = torch.cos(angle * (place[:, None] + margin + 0.5)) * math.sqrt(2 / length)
     line = place - place.mean()
@@ -595,7 +561,6 @@ def _fit_with_spectrum(gram: Tensor, right: Tensor, noise: float, smoothness: fl
     window = window / window.sum(1, keepdim=True)
     anchor = (1e-9 * matrix.diagonal().mean()).expand(1)  # makes the undetermined mean 0
     power = expected
-    amplitude, covariance = torch.zeros_like(target), matrix
     for _ in range(20):
         whole = matrix + torch.diag(torch.cat([anchor, anchor + 1 / power, anchor]))
         covariance = torch.cholesky_inverse(torch.linalg.cholesky(whole))
@@ -623,19 +588,19 @@ def _report(
     ``of_bands`` are the reasons of each axis from the row bands, ``apart`` (2,) px the rms difference of the
     displacements along a row that the motion does not explain.
     """
+    # 1. Standard deviations of the spline; and what it does not contain: a tone that displaces all frames nearly
+    # equally, and motion that is faster than the knots.
     index, weights = spline_taps(table(times).ravel(), fit.start, fit.spacing, fit.coefficients.shape[-1])
     std = tensor(np.sqrt(fit.variances(index, weights[:, None]))[:, 0]).unflatten(0, times.shape)
-    seen_and_unseen = _visible_and_common(fit, measured)
-    value = motion.displacement(times)
+    of_visible, of_common = _visible_and_common(fit, measured)
+    value, residual = motion.displacement(times), residual_of_motion(measured, motion)
     value = value - value.mean((0, 1))
-    # The power at other frequencies does not determine a tone that displaces all frames nearly equally.
-    blind = _blind_tone(table(value), table(times), seen_and_unseen[0])
-    residual = residual_of_motion(measured, motion)
+    blind = _blind_tone(table(value), table(times), of_visible)
     sudden = tensor(_sudden(measured, residual, table(times), fit.spacing))
     std = torch.hypot(torch.hypot(std, tensor(blind)), sudden)
-    std_seen = torch.hypot(tensor(seen_and_unseen[0]), sudden.square().mean((0, 1)).sqrt())
-    unseen = tensor(np.hypot(seen_and_unseen[1], blind))
-    rest = tensor(measured.unexplained(residual)[0])
+    std_seen = torch.hypot(tensor(of_visible), sudden.square().mean((0, 1)).sqrt())
+    unseen, rest = tensor(np.hypot(of_common, blind)), tensor(measured.unexplained(residual)[0])
+    # 2. The verdict.
     moved = (value - value.mean(0)).square().mean((0, 1)).sqrt()
     findings = []
     for axis, name in enumerate(AXIS_NAMES[: scale.axes]):
@@ -645,16 +610,14 @@ def _report(
         if float(std_seen[axis]) > _MAX_STD_SEEN:
             against.append(Reason("motion_uncertain", name, float(std_seen[axis]), _MAX_STD_SEEN))
         findings.append(tuple(against))
-    reliable = torch.tensor([not against for against in findings], device=rest.device)
-    units = scale.units(value)
+    # 3. From row order and px to image axes and units.
+    reliable, units = torch.tensor([not against for against in findings], device=rest.device), scale.units(value)
+    sizes = {"std": std, "std_seen": std_seen, "unseen": unseen, "unexplained": rest}
     return MotionDetection(
         motion=scale.free_motion(motion).from_row_order(timing),
         times=times,
         displacement=offsets_from_row_order(value * units, timing),
-        std=magnitudes_from_row_order(std * units, timing),
-        std_seen=magnitudes_from_row_order(std_seen * units, timing),
-        unseen=magnitudes_from_row_order(unseen * units, timing),
-        unexplained=magnitudes_from_row_order(rest * units, timing),
+        **{name: magnitudes_from_row_order(values * units, timing) for name, values in sizes.items()},
         reliable=magnitudes_from_row_order(reliable, timing),
         findings=findings_from_row_order(findings, timing),
     )
@@ -666,11 +629,7 @@ _SUDDEN = 6.0
 
 
 def _sudden(measured: Measurements, residual: Array, times: Array, spacing: float) -> Array:
-    """(T, R, A) px, residuals near motion that is faster than the knots follow, such as a step; 0 elsewhere.
-
-    They are the root of the mean square of the residuals (1, N, G, A) within a knot ``spacing`` in s of the ``times``
-    (T, R), where that is significantly larger than elsewhere.
-    """
+    """(T, R, A) px, rms residuals (1, N, G, A) within a ``spacing`` in s of times (T, R), where large; 0 elsewhere."""
     seen = measured.visible[0] > 0
     at = (measured.exposure_starts[0] + 0.5 * measured.exposure_time)[seen]
     order = np.argsort(at)
@@ -694,12 +653,9 @@ def _blind_tone(values: Array, times: Array, noise: Array) -> Array:
 
     Of a tone at ``1 + e`` times the frame rate, the frames show ``2 pi e`` of its amplitude, and e only in the change
     of that from frame to frame. The rms displacement is the mean over all e of its posterior, where such a tone beside
-    a uniformly accelerated motion explains the visible motion. Of 400 displacements by tones of 1.5 px within 8 % of
-    the frame rate in five frames, 94 % of the 95 % intervals contain the truth; 79 % did with four times the standard
-    deviation that the power at other frequencies suggests.
-
-    ``values`` (T, R, A) px are the displacements of rows at ``times`` (T, R) in s, ``noise`` (A,) px is the standard
-    deviation of their visible part.
+    a uniformly accelerated motion explains the visible one. Of 400 displacements by tones of 1.5 px within 8 % of the
+    frame rate in five frames, 94 % of the 95 % intervals contain the truth. ``values`` (T, R, A) px are displacements
+    at ``times`` (T, R) in s, ``noise`` (A,) px is the standard deviation of their visible part.
     """
     starts = times[:, 0]
     period, frames = np.diff(starts).mean(), len(starts)
@@ -740,10 +696,7 @@ def _blind_tone(values: Array, times: Array, noise: Array) -> Array:
 
 
 def _visible_and_common(fit: _SplineFit, measured: Measurements) -> tuple[Array, Array]:
-    """(A,) px, rms standard deviations for scene rows in several frames.
-
-    Those of the displacement in each frame less the mean over the frames, and those of that mean.
-    """
+    """(A,) px, rms standard deviations of displacements of scene rows less their mean over the frames, and of this."""
     seen = measured.visible[0]
     several = seen.sum(-1) > 1
     seen, times = seen[several], measured.exposure_starts[0][several] + 0.5 * measured.exposure_time

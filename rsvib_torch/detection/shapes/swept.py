@@ -11,7 +11,7 @@ from torch import Tensor
 
 from rsvib_torch.checks.arguments import check_shapes
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
+from rsvib_torch.detection.rows.grouped_frames import grouped_frames
 from rsvib_torch.detection.sensitivity import displacements_by_row_time
 from rsvib_torch.detection.shapes.free import (
     MAX_BAND_ERROR,
@@ -31,17 +31,13 @@ from rsvib_torch.execution.precision import full_precision, without_gradients
 from rsvib_torch.execution.progress import whole_steps
 from rsvib_torch.frames.entry_points import frames_options
 from rsvib_torch.frames.grey import GreyFrames, grey_frames
-from rsvib_torch.frames.orientation import (
-    findings_from_row_order,
-    magnitudes_from_row_order,
-    offsets_from_row_order,
-)
+from rsvib_torch.frames.orientation import findings_from_row_order, magnitudes_from_row_order, offsets_from_row_order
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.splines import gauss_legendre
 from rsvib_torch.numerics.tables import Array, split_axis, table, tensor, unit_wave
-from rsvib_torch.options import RegistrationOptions, SweptToneOptions
+from rsvib_torch.options import SweptToneOptions
 from rsvib_torch.results.presentation import AXIS_NAMES, JudgedResult, axis_rows, verdict_lines, verdict_table
 from rsvib_torch.results.reason import Reason
 from rsvib_torch.text import measured_text, text_table
@@ -177,7 +173,7 @@ def detect_swept_tone(frames: FramesOrFiles, timing: SensorTiming, options: Swep
     number = len(stacks.images)
     # the start of each axis, and rounds of measuring and fitting
     with threads_for(stacks.images), whole_steps(number * (3 + options.iterations), "steps") as step_done:
-        fitted = [_detect(stacks.one(index), timing, options, options.iterations, step_done) for index in range(number)]
+        fitted = [_detect(stacks.one(index), timing, options, step_done) for index in range(number)]
     step = min(_step(one.fits, one.record, timing) for one in fitted)  # motions of a batch have common knots
     tones = [_report(one, timing, step).to(stacks.images.device) for one in fitted]
     return SweptTone.stacked(tones) if stacks.batched else tones[0]
@@ -197,66 +193,75 @@ class _Fitted:
     uncertain: Tensor  # (2,) px, rms standard deviation of the motion of the rows
     against: list[list[Reason]]  # reasons against each axis from the offsets of row bands
     others: list[Tensor | None]  # another fit (6,) of each axis that agrees with the rows as well, if there is one
-    frames: int  # number of frames
-    intervals: Array  # s, between them
+    intervals: Array  # s, between the frames
 
 
 def _detect(
-    stack: GreyFrames, timing: SensorTiming, bands: RegistrationOptions, iterations: int, step_done: Callable[[], None]
+    stack: GreyFrames, timing: SensorTiming, options: SweptToneOptions, step_done: Callable[[], None]
 ) -> _Fitted:
-    """Fit of one stack: start, then rounds of measuring and fitting."""
-    rowwise, curve, record = start_curve(stack, timing, bands)
-    banded = measurements_of_curve(curve, rowwise, bands.band_step)
-    highest = 0.5 / (bands.band_rows * rowwise.row_time)
-    pairs = curve.quality.shape[1]
+    """Fit of one stack."""
+    # 1. Start from the row bands.
+    rowwise, curve, record = start_curve(stack, timing, options)
+    banded = measurements_of_curve(curve, rowwise, options.band_step)
+    highest = 0.5 / (options.band_rows * rowwise.row_time)
+    (num_frames, _, width), pairs, device = stack.images.shape[1:], curve.quality.shape[1], stack.images.device
     starts = []
     for axis in range(2):
         starts.append(_start(banded, axis, pairs, record, highest))
         step_done()
     fits = torch.stack([start[0] for start in starts])
 
+    # 2. Rounds of measuring and fitting.
     def motion_of(values: Tensor) -> FreeMotion:
         return _motion(values, record, _step(values, record, rowwise))
 
-    groups = frame_groups(
-        stack_spectra(stack.images, stack.valid), rowwise, motion_of(fits).expanded(1).to(stack.images.device)
-    )
-    for _ in range(iterations):
+    frames = grouped_frames(stack.images, stack.valid, rowwise, motion_of(fits).expanded(1).to(device))
+    for _ in range(options.iterations):
         motion = motion_of(fits)
-        measured, _ = measure_groups(groups, rowwise, motion.expanded(1).to(stack.images.device), keep_images=False)
+        measured = frames.measure(motion.expanded(1).to(device), keep_images=False).measurements
         weighed = measured.reweighted(residual_of_motion(measured, motion))
-        starts = [_with_aliases(start, (record[1] - record[0]) / len(stack.images[0])) for start in starts]
-        solved = [_settle(weighed, axis, record, starts[axis]) for axis in range(2)]
-        starts = [one[0][:4] for one in solved]
+        starts = [_with_aliases(start, (record[1] - record[0]) / num_frames) for start in starts]
+        starts = [_settle(weighed, axis, record, starts[axis])[0][:4] for axis in range(2)]
         fits = torch.stack([start[0] for start in starts])
         step_done()
+
+    # 3. The last fit, its uncertainty, and what else the rows agree with.
     solved = [_settle(weighed, axis, record, starts[axis]) for axis in range(2)]
     fits, covariances, gains = (torch.stack([one[i][0] for one in solved]) for i in range(3))
     fits = torch.where(gains[:, None] > _F_THRESHOLD, fits, _still(fits))
     motion = motion_of(fits)
     residual = residual_of_motion(measured, motion)
-    independent = weighed.independent_fraction(residual) * measured.share_counted(residual)
-    rest = tensor(measured.unexplained(residual)[0])
-    covariances = covariances / float(independent[0])
-    others = [_equally_good(one, float(independent[0]), covariances[axis]) for axis, one in enumerate(solved)]
+    independent = float((weighed.independent_fraction(residual) * measured.share_counted(residual))[0])
+    covariances = covariances / independent
+    others = [_equally_good(*one, independent) for one in solved]
     times = tensor(measured.exposure_starts[0]) + 0.5 * measured.exposure_time - 0.5 * (record[0] + record[1])
     columns = torch.stack([_relative(measured, _columns(times, fit)) for fit in fits])
     if rowwise.row_time_std:
-        by_row_time = tensor(displacements_by_row_time(measured, motion, rowwise, len(stack.images[0]))[0])
+        by_row_time = tensor(displacements_by_row_time(measured, motion, rowwise, num_frames)[0])
         heavy = tensor(weighed.inverse_variances[0]).sqrt()[:, None, :].expand(by_row_time.shape).movedim(-1, 0)
         design, data = (heavy[..., None] * columns).flatten(1, 2), (heavy * by_row_time.movedim(-1, 0)).flatten(1)
         changes = torch.linalg.lstsq(design, data[..., None], driver="gelsd").solution  # (2, 6, 1) of the parameters
         covariances = covariances + changes @ changes.mT
-    uncertain = torch.stack([_rms_std(columns[i], covariances[i]) for i in range(2)])
-    moved, frames = tensor(rms_motion(measured, motion)), len(stack.images[0])
-    against = bands_reasons(curve, stack.images.shape[-1], banded, motion)
+    variances = torch.einsum("angi,aij,angj->ang", columns, covariances, columns).clamp(min=0.0)
+
+    # 4. Reasons from the row bands.
+    against = bands_reasons(curve, width, banded, motion)
     chance = _chance(banded, motion, pairs, _STARTS * ((record[1] - record[0]) * highest) ** 2)
     for axis, error in enumerate(band_errors(banded, motion)):
         if error > MAX_BAND_ERROR and chance[axis] > _MAX_CHANCE:
             against[axis].append(Reason("tone_of_chance", AXIS_NAMES[axis], chance[axis], _MAX_CHANCE))
     step_done()
-    intervals = np.diff(table(rowwise.frame_starts(frames)))
-    return _Fitted(fits, covariances, record, moved, rest, uncertain, against, others, frames, intervals)
+    return _Fitted(
+        fits,
+        covariances,
+        record,
+        moved=tensor(rms_motion(measured, motion)),
+        unexplained=tensor(measured.unexplained(residual)[0]),
+        uncertain=variances.mean((1, 2)).sqrt(),
+        against=against,
+        others=others,
+        intervals=np.diff(table(rowwise.frame_starts(num_frames))),
+    )
 
 
 def _chance(banded: Measurements, motion: FreeMotion, pairs: int, candidates: float) -> list[float]:
@@ -280,19 +285,12 @@ def _chance(banded: Measurements, motion: FreeMotion, pairs: int, candidates: fl
     return np.minimum(candidates * left ** (0.5 * np.maximum(freedom - 2, 0)), 1.0).tolist()
 
 
-def _equally_good(
-    settled: tuple[Tensor, Tensor, Tensor, Tensor], independent: float, covariance: Tensor
-) -> Tensor | None:
+def _equally_good(fits: Tensor, covariances: Tensor, _: Tensor, excess: Tensor, independent: float) -> Tensor | None:
     """A fit of ``_settle`` that the rows do not exclude, outside the stated error of the first one; None if none is."""
-    fits, _, _, excess = settled
-    distance = (fits - fits[0])[:, 2:5].abs() / covariance.diagonal()[2:5].clamp(min=0.0).sqrt()
+    std = (covariances[0].diagonal()[2:5] / independent).clamp(min=0.0).sqrt()
+    distance = (fits - fits[0])[:, 2:5].abs() / std
     other = (distance.amax(-1) > 2 * _MAX_STD) & (excess * independent < _MAX_STD**2)
     return fits[other][0] if bool(other.any()) else None
-
-
-def _rms_std(columns: Tensor, covariance: Tensor) -> Tensor:
-    """Rms standard deviation of a displacement whose derivatives by the parameters are ``columns`` (N, G, 6)."""
-    return torch.einsum("ngi,ij,ngj->ng", columns, covariance, columns).clamp(min=0.0).mean().sqrt()
 
 
 def _still(fits: Tensor) -> Tensor:
@@ -331,8 +329,7 @@ def _start(banded: Measurements, axis: int, pairs: int, record: tuple[float, flo
     """Fits (S, 6), best first, to the offsets of the row bands of a number of frame pairs.
 
     Decay, sweep and frequency replace each other within a short record, so that fits from one start end in a minimum of
-    another tone. The best starts of a grid are therefore fitted, in a part of the record that bounds the number of
-    starts; the best fits follow the tone into the rest of the record.
+    another tone. The best starts of a grid are therefore fitted, in a part of the record that bounds their number.
     """
     # 1. The part of the record in which the offsets are largest: a tone may have decayed in the others.
     bands, period = banded.visible.shape[1] // pairs, (record[1] - record[0]) / (pairs + 1)
@@ -355,8 +352,8 @@ def _start(banded: Measurements, axis: int, pairs: int, record: tuple[float, flo
 def _best_starts(banded: Measurements, axis: int, record: tuple[float, float], highest: float) -> Tensor:
     """Start parameters (S, 6) from a grid of frequencies, sweeps and decays: the four best of each decay.
 
-    The offset of a frame pair by a start is ``p(t') E(t') - p(t) E(t)`` with ``E = exp(2 pi i f t)`` and p of its decay
-    and sweep. All sums over the offsets are products of a matrix of p and one of E.
+    An offset is ``p(t') E(t') - p(t) E(t)`` with ``E = exp(2 pi i f t)`` and p of decay and sweep. All sums over the
+    offsets are products of a matrix of p and one of E.
     """
     times = banded.exposure_starts[0] + 0.5 * banded.exposure_time  # (N, 2)
     middle, span = 0.5 * (times.max() + times.min()), np.ptp(times)
@@ -383,9 +380,8 @@ def _best_starts(banded: Measurements, axis: int, record: tuple[float, float], h
     gains = np.full((len(decays), len(steps), len(frequencies)), -np.inf)
     for place, step in enumerate(steps):
         # 3. Sums over the bands for all decays: products of the wave with values, image motion and itself.
-        envelope = np.exp(
-            -decays[:, None, None] * times + 2j * math.pi * step / span**2 * np.square(times)
-        )  # (D, N, 2)
+        sweep = 2j * math.pi * step / span**2 * np.square(times)
+        envelope = np.exp(-decays[:, None, None] * times + sweep)  # (D, N, 2)
         of_earlier, of_later, *of_squares = (wave[:, lowest[place] :] for wave in (earlier, later, *squares))
         p, q = envelope[..., 0], envelope[..., 1]
         linear = weight * np.stack([value, drift])[:, None]  # (2, 1, N)
@@ -398,9 +394,8 @@ def _best_starts(banded: Measurements, axis: int, record: tuple[float, float], h
             square, modulus * (1 + 1e-9), with_value, with_drift, drift_value, drift_drift
         )
     # 4. The four best frequencies of each decay, each with its best sweep.
-    sweep, power = gains.argmax(1), gains.max(1)
     starts = []
-    for decay, sweep_of, power_of in zip(decays, sweep, power, strict=True):
+    for decay, sweep_of, power_of in zip(decays, gains.argmax(1), gains.max(1), strict=True):
         chosen: list[int] = []
         for k in power_of.argsort()[::-1].tolist():
             if len(chosen) < 4 and all(abs(k - other) > 1 for other in chosen):
@@ -418,9 +413,8 @@ def _settle(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Levenberg-Marquardt from several starts (S, 6) side by side, for one axis of one stack.
 
-    Returns:
-        Best fit first: parameters (S, 6), their covariances (S, 6, 6), decrease of chi-square per parameter (S,) by the
-        tone, and chi-square less that of the best fit (S,).
+    Best fit first: parameters (S, 6), covariances (S, 6, 6), decrease of chi-square per parameter (S,) by the tone, and
+    chi-square less that of the best fit (S,).
     """
     middle = 0.5 * (record[0] + record[1])
     weight = tensor(measured.inverse_variances[0, :, axis])
@@ -431,11 +425,11 @@ def _settle(
     duration = measured.exposure_time + measured.average_times[axis]
     first = tensor(measured.exposure_starts[0]) + 0.5 * (measured.exposure_time - duration) - middle
     nodes, shares = gauss_legendre(4)
-    quadrature = list(zip(nodes.tolist(), shares.tolist(), strict=True))
+    quadrature = list(zip((first[..., None] + duration * nodes).unbind(-1), shares.tolist(), strict=True))
 
     def averaged(function: Callable[[Tensor, Tensor], Tensor], at: Tensor) -> Tensor:
         """(S, N, G, P) relative means over exposures of a function (N, G, S, P) of times and parameters."""
-        at_nodes = [share * function((first + duration * node)[..., None], at) for node, share in quadrature]
+        at_nodes = [share * function(time[..., None], at) for time, share in quadrature]
         relative: Tensor = _relative(measured, torch.stack(at_nodes).sum(0).flatten(2)).unflatten(-1, (len(at), -1))
         return relative.movedim(2, 0)
 
@@ -467,7 +461,7 @@ def _settle(
         if bool(settled.all()):
             break
     without = residual_of(_still(fits))
-    drift = _relative(measured, (first + duration * quadrature[0][0])[..., None])[..., 0]
+    drift = _relative(measured, first[..., None])[..., 0]
     norm = (row_weight * drift.square()).sum() + 1e-300
     drift_only = cost_of(without) - (row_weight * drift * without).sum((1, 2)).square() / norm
     noise = cost / known
@@ -514,7 +508,7 @@ def _with_aliases(fits: Tensor, period: float) -> Tensor:
 def _report(fitted: _Fitted, timing: SensorTiming, step: float) -> SweptTone:
     """Parameters at the time origin and in image axes, with standard deviations and verdict."""
     middle = 0.5 * (fitted.record[0] + fitted.record[1])
-    reverse = timing.readout_direction == "reverse"
+    reverse, num_frames = timing.readout_direction == "reverse", len(fitted.intervals) + 1
     values, stds, findings = [], [], []
     for axis, (fit, covariance) in enumerate(zip(fitted.fits, fitted.covariances, strict=True)):
         present = bool(fit[:2].abs().sum() > 0)
@@ -528,8 +522,8 @@ def _report(fitted: _Fitted, timing: SensorTiming, step: float) -> SweptTone:
         stds.append(std if present else 0 * std)
         name = AXIS_NAMES[axis]
         against = [] if present else [Reason("no_tone", name)]
-        if present and fitted.frames < _MIN_FRAMES:
-            against.append(Reason("too_few_frames_for_sweep", name, fitted.frames, _MIN_FRAMES))
+        if present and num_frames < _MIN_FRAMES:
+            against.append(Reason("too_few_frames_for_sweep", name, num_frames, _MIN_FRAMES))
         elif present and (other := fitted.others[axis]) is not None:
             details = {"frequency": float(other[2]), "decay": float(other[3])}
             against.append(Reason("other_swept_tone", name, details=details))
@@ -540,8 +534,8 @@ def _report(fitted: _Fitted, timing: SensorTiming, step: float) -> SweptTone:
         if present and gain < MIN_GAIN:
             against.append(Reason("tone_blind", name, gain, MIN_GAIN, {"frequency": float(fit[2])}))
         uncertain, size = float(fitted.uncertain[axis]), float(fitted.moved[axis])
-        if present and uncertain > MAX_DISPLACEMENT_STD * size:
-            allowed = MAX_DISPLACEMENT_STD * size
+        allowed = MAX_DISPLACEMENT_STD * size
+        if present and uncertain > allowed:
             against.append(Reason("displacement_uncertain", name, uncertain, allowed, {"size": size}))
         against += fitted.against[axis] if present else []
         against += unexplained_reasons(name, float(fitted.unexplained[axis]), size, "swept tone")

@@ -8,6 +8,7 @@ coupling of the scan with motion along it are part of the model, and all tones o
 import math
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -80,10 +81,9 @@ class ToneFit:
 def tone_response(measurements: Measurements, frequencies: Array) -> Array:
     """Relative displacements, complex128 (B, N, G, 2, K), that unit tones of frequencies (B, 2, K) in Hz cause.
 
-    ``S(f) exp(2 pi i f (t - centre))`` at the mid-exposures t of the rows, less the mean over the frames of the group.
-    ``S(f) = sinc(f T_e) sinc(f h T_row)`` is the attenuation by exposure (Eq. 2) and by a band of h rows; the
-    difference from the group mean is the gain of Eq. (4). The times t contain the coupling of the scan with motion
-    along it.
+    ``S(f) exp(2 pi i f (t - centre))`` at the mid-exposures t of the rows, less the mean over the frames of the group,
+    which is the gain of Eq. (4). ``S(f) = sinc(f T_e) sinc(f h T_row)`` is the attenuation by exposure (Eq. 2) and by a
+    band of h rows. The times t contain the coupling of the scan with motion along it.
     """
     return measurements.relative(_tones_at(measurements, frequencies))
 
@@ -116,11 +116,7 @@ def residual_of(measurements: Measurements, fit: ToneFit) -> Array:
 
 
 def _jacobian_of_tones(smearing_times: Array, time: Array, tones: Array) -> Array:
-    """Derivatives (B, N, G, 2, 3 K) of mean displacements by Re C, Im C and f of each tone.
-
-    ``smearing_times`` as in ``Measurements``; ``time`` (B, N, G, 1, 1) in s are mid-exposures from the centre of the
-    record; ``tones`` (B, 2, K, 3) are Re C and Im C in px, and f >= 0 in Hz.
-    """
+    """Derivatives (B, N, G, 2, 3 K) of displacements by Re C, Im C in px and f >= 0 in Hz of tones (B, 2, K, 3)."""
     frequencies = tones[..., 2]
     smeared, smeared_slope = _sinc(frequencies * smearing_times)
     attenuation = smeared[0] * smeared[1]
@@ -157,8 +153,7 @@ def _constraints(model: MotionModel, tones: int, axes: int) -> Array:
         column += 3 if harmonic == 0 else 2
     for power in range(model.drift_order):
         matrix[3 * tones + power, column + power] = 1.0
-    of_axes: Array = block_diag(*[matrix] * axes)
-    return of_axes
+    return block_diag(*[matrix] * axes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,10 +169,7 @@ class _Estimate:
 
 
 class _Problem:
-    """Nonlinear least squares ``min sum_n r_n^T W_n r_n`` for the ``active`` (B, 2, K) tones of displacements.
-
-    r is the residual and W the information of scene row n.
-    """
+    """Nonlinear least squares ``min sum_n r_n^T W_n r_n`` of the rows for the ``active`` (B, 2, K) tones."""
 
     def __init__(self, measurements: Measurements, active: Array, model: MotionModel) -> None:
         self.measurements, self.active, self.model = measurements, active, model
@@ -204,10 +196,9 @@ class _Problem:
 
     def fit(self, values: Array, covariance: Array) -> ToneFit:
         """The parameters (B, 2, P) as a ``ToneFit``."""
-        real, imaginary, frequencies = np.moveaxis(self.tones_of(values), -1, 0)
-        coefficients, drift = real + 1j * imaginary, values[..., 3 * self.tones :]
-        centre = self.measurements.centre
-        return ToneFit(coefficients, frequencies, self.active, drift, covariance, centre, self.model)
+        (real, imaginary, frequencies), drift = np.moveaxis(self.tones_of(values), -1, 0), values[..., 3 * self.tones :]
+        centre, model = self.measurements.centre, self.model
+        return ToneFit(real + 1j * imaginary, frequencies, self.active, drift, covariance, centre, model)
 
     def jacobian(self, values: Array) -> Array:
         """Derivatives (B, N, G, 2, P) of the displacements of each axis by its parameters (B, 2, P)."""
@@ -238,21 +229,22 @@ class _Problem:
         mixed = np.linalg.solve(safe.mT, scaled)  # (B, N, 1, A, A)
         to_all = inverse if self.to_all is None else self.to_all @ inverse
         columns = self._whitened(mixed, state.jacobian) @ to_all
-        covariance = columns.mT @ columns
+        return self._of_all(columns.mT @ columns)
+
+    def _of_all(self, covariance: Array) -> Array:
+        """Covariance (B, A P, A P) of all parameters from that (B, M, M) of the free ones."""
         return covariance if self.to_all is None else self.to_all @ covariance @ self.to_all.T
 
     def inverse(self, state: _Estimate) -> Array:
         """Inverse (B, M, M) of the normal matrix of the free parameters; 0 for the others."""
         matrix, scale = _scaled(state, self.free, np.zeros_like(state.cost))
-        inverse: Array = np.linalg.inv(matrix) * scale[:, :, None] * scale[:, None]
-        return inverse
+        return np.linalg.inv(matrix) * scale[:, :, None] * scale[:, None]
 
     def covariance_of_blocks(self, state: _Estimate) -> Array:
         """Covariance (B, A P, A P) from the scatter of the residuals between blocks of the scene.
 
-        A block of rows shows the same part of the scene in all frames, whose errors need not be independent: with the
-        sums ``u_n`` of its whitened derivatives times residuals over all frames, it is ``H^-1 sum u_n u_n^T H^-1``
-        (Liang and Zeger, Biometrika 73, 13, 1986).
+        Errors of a block may be alike in all frames: with the sums ``u_n`` of its whitened derivatives times residuals
+        over these, it is ``H^-1 sum u_n u_n^T H^-1`` (Liang and Zeger, Biometrika 73, 13, 1986).
         """
         inverse = self.inverse(state)
         columns, whitened = self.in_std(state.jacobian, state.residual)
@@ -265,8 +257,7 @@ class _Problem:
             meat = meat + (1 - lag / 3) * (product + product.mT)
         used = (np.abs(sums).max(-1) > 0).sum(-1)
         spent = self.free.sum(-1) / self.axes
-        covariance = inverse @ meat @ inverse * (used / np.maximum(used - spent, 1.0))[:, None, None]
-        return covariance if self.to_all is None else self.to_all @ covariance @ self.to_all.T
+        return self._of_all(inverse @ meat @ inverse * (used / np.maximum(used - spent, 1.0))[:, None, None])
 
     @staticmethod
     def _whitened(root: Array, jacobian: Array) -> Array:
@@ -304,10 +295,7 @@ class _Problem:
         return self.evaluate(self.moved(state.values, _step(state, self.linear, np.zeros_like(state.cost))))
 
     def solve(self, start: Array | ToneFit, iterations: int, tolerance: float) -> _Estimate:
-        """Levenberg-Marquardt from start frequencies or another fit, each stack on its own.
-
-        It ends when a step promises a relative decrease of the cost below the tolerance.
-        """
+        """Levenberg-Marquardt, each stack on its own, until a step promises a relative decrease below the tolerance."""
         # 1. Start values.
         if isinstance(start, ToneFit):
             start = start.about(self.measurements.centre)
@@ -358,10 +346,7 @@ def _step(state: _Estimate, free: Array, damping: Array) -> Array:
 def fit_roughly(
     measurements: Measurements, start: Array | ToneFit, active: Array, model: MotionModel, iterations: int = 5
 ) -> tuple[ToneFit, Array]:
-    """A few steps of ``fit_tones``, as a start for another fit; also returns the residual displacements (B, N, G, 2).
-
-    The covariance of the fit has no meaning.
-    """
+    """A few steps of ``fit_tones``, without its covariance, and the residual displacements (B, N, G, 2)."""
     problem = _Problem(measurements, active, model)
     state = problem.solve(start, iterations, tolerance=1e-4)
     return problem.fit(state.values, state.matrix), state.residual
@@ -376,14 +361,11 @@ def fit_tones(
 ) -> ToneFit:
     """Fit all tones of both axes and the image motion by weighted least squares (Levenberg-Marquardt).
 
-    The gain of Eq. (7) is part of the model, so that a negative gain needs no special case. ``start`` are frequencies
-    (B, 2, K) in Hz, or an earlier fit of the same tones; with harmonics, K is a multiple of their number, each family
-    with its fundamental first. Tones that are not ``active`` (B, 2, K) stay at zero.
+    ``start`` are frequencies (B, 2, K) in Hz, or an earlier fit of the same tones; with harmonics, K is a multiple of
+    their number, each family with its fundamental first. Tones that are not ``active`` (B, 2, K) stay at zero.
 
-    Returns:
-        The fit with its covariance. The variance of the errors of each axis is that of its residuals: with
-        ``S = diag(s_x, s_y)`` the errors of a row have the covariance ``S W^-1 S`` instead of the ``W^-1`` of the fit.
-        With roll and zoom, all axes have one variance.
+    The variance of the errors of each axis is that of its residuals: with ``S = diag(s_x, s_y)`` the errors of a row
+    have the covariance ``S W^-1 S`` instead of the ``W^-1`` of the fit. With roll and zoom, all axes have one variance.
     """
     problem = _Problem(measurements, active, model or MotionModel())
     state = problem.solve(start, iterations, tolerance=1e-7)
@@ -420,10 +402,9 @@ def with_errors_of_blocks(measurements: Measurements, fit: ToneFit) -> ToneFit:
 
 
 def with_unknown_errors(measurements: Measurements, fit: ToneFit) -> ToneFit:
-    """The fit with the largest possible errors on axes with hardly more independent measurements than parameters.
+    """The fit with errors as large as the displacements on axes with no more independent measurements than parameters.
 
-    Such a fit is exact for any errors, and its residual contains nothing of them. They may be as large as the
-    displacements.
+    Such a fit is exact for any errors, and its residual contains nothing of them.
     """
     problem = _Problem(measurements, fit.active, fit.model)
     unknown = problem.num_spare <= 0.0
@@ -431,8 +412,7 @@ def with_unknown_errors(measurements: Measurements, fit: ToneFit) -> ToneFit:
         return fit
     fit = fit.about(measurements.centre)
     state = problem.evaluate(fit.parameters)
-    whole = measurements.square(measurements.displacements)
-    largest = whole / np.maximum(measurements.num_measurements, 1.0)
+    largest = measurements.square(measurements.displacements) / np.maximum(measurements.num_measurements, 1.0)
     variances = np.where(unknown, largest, problem.variances(state))
     return replace(fit, covariance=problem.covariance(state, np.sqrt(variances)))
 
@@ -463,10 +443,7 @@ def offset_gain(frequencies: Array, intervals: Array) -> Array:
 
 
 def motion_of_fit(fit: ToneFit, device: torch.device | None = None) -> Vibration:
-    """Vibration (B, 2, K) of a fit: ``A = |C|``, ``phi = arg C + pi/2 - 2 pi f centre`` (Eqs. 6-8).
-
-    Gain and exposure are part of the fit. Tones that are not active have amplitude and frequency 0.
-    """
+    """Vibration (B, 2, K) of a fit: ``A = |C|``, ``phi = arg C + pi/2 - 2 pi f centre`` (Eqs. 6-8); 0 if not active."""
     centre = fit.centre[:, None, None]
     frequency = np.where(fit.active, fit.frequencies, 0.0)
     phase = np.angle(fit.coefficients) + 0.5 * math.pi - 2 * math.pi * frequency * centre
@@ -482,10 +459,7 @@ def motion_of_fit(fit: ToneFit, device: torch.device | None = None) -> Vibration
 
 
 def vibration_of_fit(fit: ToneFit) -> tuple[Vibration, VibrationStd]:
-    """Vibration (B, 2, K) of a fit as in ``motion_of_fit``, and its standard deviations.
-
-    Errors are propagated to first order with all covariances. Tones that are not active have standard deviation 0.
-    """
+    """``motion_of_fit`` and its standard deviations to first order; 0 for tones that are not active."""
     centre = fit.centre[:, None, None]
     real, imaginary, amplitude = _direction(fit)
     zero = np.zeros_like(real)
@@ -499,17 +473,14 @@ def vibration_of_fit(fit: ToneFit) -> tuple[Vibration, VibrationStd]:
     amplitude_std, frequency_std, phase_std = np.take_along_axis(deviations, order[None], -1)
     frequency = np.take_along_axis(np.where(fit.active, fit.frequencies, 0.0), order, -1)
     period_std = frequency_std / np.square(np.where(frequency > 0, frequency, 1.0))
-    drift = _covariance_of_axes(fit)[..., 3 * fit.frequencies.shape[-1] :, 3 * fit.frequencies.shape[-1] :]
-    motion_variance, acceleration_variance = drift[..., 0, 0], np.zeros_like(drift[..., 0, 0])
+    first = 3 * fit.frequencies.shape[-1]
+    drift = _covariance_of_axes(fit)[..., first:, first:]
+    of_motion, of_acceleration = drift[..., 0, 0], np.zeros_like(drift[..., 0, 0])
     if fit.drift.shape[-1] > 1:
-        acceleration_variance = drift[..., 1, 1]
-        to_origin = centre[..., 0]
-        motion_variance = (
-            motion_variance - 2 * to_origin * drift[..., 0, 1] + np.square(to_origin) * acceleration_variance
-        )
-    variances = np.maximum([motion_variance, acceleration_variance], 0.0)
-    motion_std, acceleration_std = np.sqrt(variances)
-    of_parameters = (amplitude_std, frequency_std, period_std, phase_std, motion_std, acceleration_std)
+        of_acceleration, to_origin = drift[..., 1, 1], centre[..., 0]
+        of_motion = of_motion - 2 * to_origin * drift[..., 0, 1] + np.square(to_origin) * of_acceleration
+    drift_std = np.sqrt(np.maximum([of_motion, of_acceleration], 0.0))
+    of_parameters = (amplitude_std, frequency_std, period_std, phase_std, *drift_std)
     return motion_of_fit(fit), VibrationStd(*map(tensor, of_parameters))
 
 
@@ -556,8 +527,8 @@ def shrunk(fit: ToneFit, intervals: Array) -> ToneFit:
     """The fit with uncertain amplitudes near blind frequencies reduced, for warping frames by its motion.
 
     An amplitude A of standard deviation s becomes ``A max(0, 1 - s^2 / A^2)`` (positive-part James-Stein estimate)
-    where the gain is small. Where the gain is large, the tone moves the frames by what was measured, and stays. Tones
-    that hardly move the frames against each other, but through ``LARGEST`` of their size, are left out.
+    where the gain is small. Tones that hardly move the frames against each other, but through ``LARGEST`` of their
+    size, are left out.
     """
     blindness = 1 / (1 + np.square(offset_gain(fit.frequencies, intervals) / MIN_GAIN))
     noise = np.square(amplitude_std(fit) / np.maximum(np.abs(fit.coefficients), 1e-30))
@@ -580,42 +551,27 @@ def strongest_only(fit: ToneFit) -> ToneFit:
 
 def with_tones(fit: ToneFit, count: int) -> ToneFit:
     """The fit with room for ``count`` tones on each axis; the further ones do not exist."""
+    further = ((0, 0), (0, 0), (0, count - fit.active.shape[-1]))
+    names = ("coefficients", "frequencies", "active")
+    extended: dict[str, Any] = {name: np.pad(getattr(fit, name), further) for name in names}
+    return replace(fit, **extended, covariance=covariance_with_tones(fit.covariance, fit, count))
+
+
+def covariance_with_tones(covariance: Array, fit: ToneFit, count: int) -> Array:
+    """A covariance (B, A P, A P) of the parameters of a fit as that of ``count`` tones on each axis; 0 for others."""
     axes, tones = fit.active.shape[1:]
-    further = ((0, 0), (0, 0), (0, count - tones))
-    covariance = split_axis(split_axis(fit.covariance, 2, axes, -1), 1, axes, -1)
-    covariance = with_tone_parameters(with_tone_parameters(covariance, 2, tones, count), 4, tones, count)
-    return replace(
-        fit,
-        coefficients=np.pad(fit.coefficients, further),
-        frequencies=np.pad(fit.frequencies, further),
-        active=np.pad(fit.active, further),
-        covariance=covariance.reshape(len(covariance), axes * covariance.shape[2], -1),
-    )
-
-
-def with_tone_parameters(values: Array, axis: int, tones: int, count: int) -> Array:
-    """Values with the parameters of an axis, of ``tones`` tones and the drift, as those of ``count`` tones; 0 there."""
-    of_tones, of_drift = np.split(values, [3 * tones], axis)
-    further = np.zeros((*values.shape[:axis], 3 * (count - tones), *values.shape[axis + 1 :]))
-    return np.concatenate([of_tones, further, of_drift], axis)
+    added = np.full(axes, 3 * (count - tones))
+    places = np.repeat((np.arange(axes) + 1) * (covariance.shape[-1] // axes) - fit.drift.shape[-1], added)
+    return np.insert(np.insert(covariance, places, 0.0, 1), places, 0.0, 2)
 
 
 def with_axes(fit: ToneFit, axes: int) -> ToneFit:
     """The strongest tones of a fit as one with further axes, which have no tones; without a covariance."""
     fit = strongest_only(fit)
-    missing = axes - fit.active.shape[1]
-
-    def extended(values: Array) -> Array:
-        return np.pad(values, ((0, 0), (0, missing), (0, 0)))
-
-    return replace(
-        fit,
-        coefficients=extended(fit.coefficients),
-        frequencies=extended(fit.frequencies),
-        active=extended(fit.active),
-        drift=extended(fit.drift),
-        covariance=fit.covariance[:, :0, :0],
-    )
+    further = ((0, 0), (0, axes - fit.active.shape[1]), (0, 0))
+    names = ("coefficients", "frequencies", "active", "drift")
+    extended: dict[str, Any] = {name: np.pad(getattr(fit, name), further) for name in names}
+    return replace(fit, **extended, covariance=fit.covariance[:, :0, :0])
 
 
 def _covariance_of_axes(fit: ToneFit) -> Array:

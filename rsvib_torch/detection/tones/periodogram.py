@@ -19,18 +19,11 @@ _TINY = 1e-300  # keeps equations solvable where nothing was measured
 # --- Periodogram ---
 
 
-def _grid(duration: float, sample_interval: float) -> tuple[float, int, int]:
-    """Step in Hz, first and number of the multiples of it from half a period up to the Nyquist limit of the samples."""
-    step = 1.0 / (_OVERSAMPLING * (duration + sample_interval))
-    first = _OVERSAMPLING // 2
-    return step, first, max(1, int(0.5 / sample_interval / step) - first + 1)
-
-
 def _power(measurements: Measurements, grid: tuple[float, int, int], weights: Array) -> Array:
     """Decrease (B, S, A, F) of the weighted sum of squares by a tone of each frequency and a uniform image motion.
 
-    A weak prior on the amplitude suppresses blind frequencies, where a huge tone would fit noise. ``weights`` (B, S, N,
-    A) are several weightings of the displacements.
+    A weak prior on the amplitude suppresses blind frequencies, where a huge tone would fit noise. The grid is that of
+    ``fourier_sums``; ``weights`` (B, S, N, A) are several weightings of the displacements.
 
     All sums over waves ``E = exp(2 pi i f t)`` are transforms. With ``A = sum_g E_g`` over the n frames that contain a
     row, the squares of the cosine and of the sine relative to their means over these frames are ``(R + Re Q) / 2`` and
@@ -95,8 +88,9 @@ def strongest_frequencies(
     Measurements are ``sample_interval`` seconds apart; the powers of ``harmonics`` multiples are added up; the search
     is made with each of S ``weights`` (B, S, N, 2).
     """
-    grid = _grid(float(measurements.duration.max()), sample_interval)
-    window = _OVERSAMPLING // 2
+    # multiples of a step, from half a period up to the Nyquist limit of the samples
+    step, window = 1.0 / (_OVERSAMPLING * (float(measurements.duration.max()) + sample_interval)), _OVERSAMPLING // 2
+    grid = step, window, max(1, int(0.5 / sample_interval / step) - window + 1)
     stacks, weightings = weights.shape[:2]
     at_once, count = max(1, _MAX_POWERS // grid[2]), min(count, grid[2])
     places = np.empty((stacks, weightings, weights.shape[-1], count), np.int64)
@@ -111,10 +105,7 @@ def strongest_frequencies(
 
 
 def _of_families(total: Array, first: int, harmonics: int) -> Array:
-    """Power (..., F) of multiples of a frequency, from the ``first`` on, with that of the multiples of each.
-
-    Half the fundamental explains as much by its even multiples: of nearly equal powers, the highest frequency wins.
-    """
+    """Power (..., F) of frequencies with that of their multiples; of nearly equal ones, the highest frequency wins."""
     if harmonics == 1:
         return total
     place = np.arange(total.shape[-1]) + first
@@ -143,10 +134,7 @@ def visibility(measurements: Measurements, frequencies: Array) -> Array:
 
 
 def without_stretches(measurements: Measurements) -> Array:
-    """(8, N) bool, rows to use: all, then all but one of seven stretches of 35 % that overlap by about two thirds.
-
-    A stretch of outliers of up to 24 % of the rows lies within one of them.
-    """
+    """(8, N) bool, rows to use: all, then all but one of seven overlapping stretches of 35 %, for outliers of 24 %."""
     rows = measurements.exposure_starts.shape[1]
     place = (np.arange(rows) + 0.5) / rows
     first = np.linspace(0, 0.65, 7)[:, None]
@@ -168,15 +156,16 @@ def best_candidate(
 
     The peaks of the periodogram of the ``residual`` (B, N, G, 2) px of the fit ``before`` are fitted roughly, each with
     the tones of that fit. ``weighed`` are the measurements with its weights, ``active`` (B, 2, K) its tones and the
-    further one (or family). With ``leave_out``, fits without a stretch of the record are tried as well: clouds and
-    objects that move by themselves cover stretches of rows, without which the other rows agree.
+    further one (or family). With ``leave_out``, fits without a stretch of the record, which may be covered by clouds or
+    objects that move by themselves, are tried as well.
     """
     # 1. The parts of the record that are searched: all rows, and the rows without a stretch.
     model, harmonics = before.model, before.model.harmonics
     parts, weights, peaks = measurements, weighed.weights[:, None], 4  # outliers may raise a wrong peak
     if leave_out:
         kept = without_stretches(measurements)
-        parts = measurements.repeated(len(kept)).only(np.tile(kept, (len(measurements.exposure_starts), 1)))
+        used = np.tile(kept, (len(measurements.exposure_starts), 1))[..., None].astype(np.float64)
+        parts = measurements.repeated(len(kept)).scaled(used)
         weights, peaks = np.concatenate([weights, kept[1:, :, None] * measurements.weights[:, None]], 1), 2
     # 2. The highest peaks of each part, for the two axes, each fitted roughly with the tones of the earlier fit.
     unexplained = replace(measurements, displacements=residual)
@@ -205,13 +194,9 @@ def best_candidate(
         place = best.reshape(-1, 1, best.shape[-1], *(1,) * (tried.ndim - 3))
         return np.moveaxis(np.take_along_axis(tried, place, 1)[:, 0], 1, axis)
 
-    coefficients, frequencies, drift = (
-        chosen(values, 1) for values in (rough.coefficients, rough.frequencies, rough.drift)
-    )
-    fit, residual = (
-        ToneFit(coefficients, frequencies, active, drift, rough.covariance[:0], before.centre, model),
-        chosen(residuals, 3),
-    )
+    best_tones = {name: chosen(getattr(rough, name), 1) for name in ("coefficients", "frequencies", "drift")}
+    fit = ToneFit(**best_tones, active=active, covariance=rough.covariance[:0], centre=before.centre, model=model)
+    residual = chosen(residuals, 3)
     # 4. Without a stretch: steps towards the least absolute residuals of all rows.
     for _ in range(3 if leave_out else 0):
         fit, residual = fit_roughly(measurements.for_least_absolute(residual), fit, active, model)

@@ -1,6 +1,6 @@
 """Number of tones: added one by one, strongest first, while they are significant, with weights against outliers."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,10 +37,9 @@ def robust_fit(
 ) -> tuple[ToneFit, Measurements]:
     """Fit with the weights of outliers reduced in two steps (Tukey's biweight), and measurements with these weights.
 
-    Amplitudes and phases follow by linear equations from the ``frequencies`` (B, 2, K) in Hz to start from, of which
-    some are ``active``; starts with those of an earlier fit take more steps along the valleys of slow tones. With the
-    ``residual`` (B, N, G, 2) px of an earlier fit there is no fit of equal weights first, and with that of a fit with
-    reduced weights one of the ``steps`` suffices.
+    It starts from ``frequencies`` (B, 2, K) in Hz, of which some are ``active``; starts with the amplitudes of an
+    earlier fit take more steps along the valleys of slow tones. With the ``residual`` (B, N, G, 2) px of an earlier fit
+    there is no fit of equal weights first, and with that of a fit with reduced weights one of the ``steps`` suffices.
     """
     if residual is None:
         rough, residual = fit_roughly(measurements, frequencies, active, model)
@@ -58,10 +57,10 @@ _ALIASES, _WRONG_SIZE = 2, 3.0  # frequencies on either side; standard deviation
 def with_best_aliases(measurements: Measurements, fit: ToneFit) -> ToneFit:
     """One tone of each axis, of the frequency ``f + k / T`` that leaves the smallest residual; without covariance.
 
-    Tones that are a multiple of 1 / T apart, T the interval of the frames, differ within a frame only. The offsets of
-    bands may confuse them: in 7 of 72 stacks of 6 to 8 frames, a tone of 90.5 Hz was taken for one of 30.2 Hz, and
-    further tones explained the difference, so that the axis was reliable and wrong. The measurements are of rows, the
-    fit has one tone of each axis; stacks with a small residual are not changed.
+    Tones that are a multiple of 1 / T apart, T the interval of the frames, differ within a frame only. Bands may
+    confuse them: in 7 of 72 stacks of 6 to 8 frames, a tone of 90.5 Hz was taken for one of 30.2 Hz, and further tones
+    explained the difference, so that the axis was reliable and wrong. The measurements are of rows, the fit has one
+    tone of each axis; stacks with a small residual are not changed.
     """
     size = without_nan(median(measurements.sizes(residual_of(measurements, fit)), 1), 0.0)  # (B, A)
     wrong = (size > _WRONG_SIZE) & fit.active[..., 0]
@@ -105,37 +104,18 @@ def find_tones(
     stretches: bool = True,
     iterations: int = 30,
 ) -> ToneFit:
-    """Find and fit the tones of both axes; no initial guess is needed.
+    """Find and fit the tones of both axes; K is the largest number of any axis, at least 1.
 
     The strongest tone of the gain-aware periodogram is added and all parameters are fitted again, until ``tones`` are
     found, or until the next one is not significant: it must pass an F-test and explain ``least_gain`` of the residual.
-
-    Args:
-        measurements: The displacements.
-        sample_interval: Seconds between neighbouring rows or bands.
-        tones: Number of tones of each axis (of families, where harmonics are tied); None to choose it from the data.
-        model: Structure of the motion.
-        least_gain: Share of the residual sum of squares that a further tone must explain.
-        start: Fit whose tones are accepted.
-        blind: (F,) Hz, blind frequencies of the frames, to recognise side tones of blind tones.
-        accuracy: px; a fit is good enough once nearly all residuals of an axis are smaller.
-        stretches: Whether the search allows for stretches of outliers, if there is no start.
-        iterations: As in ``fit_tones``.
-
-    Returns:
-        The fit, with K the largest number of tones of any axis (at least 1).
+    Rows or bands are ``sample_interval`` seconds apart. ``tones`` are those of each axis (families, where harmonics are
+    tied), None to choose their number from the data; those of the fit ``start`` are accepted. ``blind`` (F,) in Hz are
+    the blind frequencies of the frames, to recognise side tones. A fit is good enough once nearly all residuals of an
+    axis are below the ``accuracy`` in px. ``stretches``: whether the search allows for stretches of outliers, if there
+    is no start; ``iterations`` as in ``fit_tones``.
     """
-    search = _Search(
-        measurements,
-        sample_interval,
-        tones,
-        model or MotionModel(),
-        least_gain,
-        start,
-        accuracy,
-        stretches=stretches and start is None,
-        iterations=iterations,
-    )
+    model, stretches = model or MotionModel(), stretches and start is None
+    search = _Search(measurements, sample_interval, tones, model, least_gain, start, accuracy, stretches, iterations)
     while search.step():
         pass
     if blind is None or tones is not None:
@@ -143,49 +123,42 @@ def find_tones(
     return _with_blind_tones(measurements, search.weighted, search.fit, blind)
 
 
+@dataclass(eq=False)
 class _Search:
-    """State of ``find_tones``, whose arguments it has.
+    """State of ``find_tones``, whose arguments it has."""
 
-    Attributes:
-        fit: The fit with the tones that are accepted.
-        weighted: The measurements with its weights.
-        open_axes: (B, 2) bool, axes that may need a further tone.
-    """
+    measurements: Measurements
+    sample_interval: float
+    tones: int | None
+    model: MotionModel
+    least_gain: float
+    start: ToneFit | None
+    accuracy: float
+    stretches: bool
+    iterations: int
 
-    def __init__(
-        self,
-        measurements: Measurements,
-        sample_interval: float,
-        tones: int | None,
-        model: MotionModel,
-        least_gain: float,
-        start: ToneFit | None,
-        accuracy: float,
-        *,
-        stretches: bool,
-        iterations: int,
-    ) -> None:
-        self.measurements, self.sample_interval, self.tones, self.model = measurements, sample_interval, tones, model
-        self.least_gain, self.accuracy = least_gain, accuracy
-        self.stretches, self.iterations, self.has_start = stretches, iterations, start is not None
-        stacks, axes = len(measurements.exposure_starts), measurements.displacements.shape[-1]
+    def __post_init__(self) -> None:
+        start = self.start
+        stacks, axes = len(self.measurements.exposure_starts), self.measurements.displacements.shape[-1]
+        # the tones that are accepted, the fit with them, and the measurements with its weights
         if start is None:
-            none = np.zeros((stacks, axes, model.harmonics), dtype=bool)
+            none = np.zeros((stacks, axes, self.model.harmonics), dtype=bool)
             self.accepted = none[..., :0]
             self.fit, self.weighted = self.refitted(none.astype(np.float64), none)
         else:
             self.accepted = start.active
-            residual = residual_of(measurements, start)
+            residual = residual_of(self.measurements, start)
             self.fit, self.weighted = self.refitted(start.frequencies, start.active, residual)
-        self.open_axes: Array = np.ones_like(self.fit.active[..., 0])
-        if start is not None and accuracy:  # a tone of roll in bands of strips is found as a tone of x or y otherwise
+        self.open_axes: Array = np.ones((stacks, axes), dtype=bool)  # that may need a further tone
+        if start is not None and self.accuracy:  # a tone of roll in bands of strips is found as one of x or y otherwise
             self.open_axes = ~np.any(start.active, -1)
-        self._remaining = MAX_TONES - (self.accepted.shape[-1] // model.harmonics if tones is None else 0)
+        number = 0 if self.tones is not None else self.accepted.shape[-1] // self.model.harmonics
+        self.remaining = MAX_TONES - number
 
     def step(self) -> bool:
         """Add a tone to the axes that need it; False if no axis does, or none is significant."""
-        self._remaining -= 1
-        if self._remaining < 0:
+        self.remaining -= 1
+        if self.remaining < 0:
             return False
         # 1. The axes that need a further tone: those with fewer tones than requested, or with a large residual.
         first = self.accepted.shape[-1] == 0
@@ -199,7 +172,7 @@ class _Search:
         # 2. The best candidate, fitted roughly. Most further tones fail the F-test by far, and are not fitted exactly;
         # offsets of bands need exact fits.
         rough = self.candidate(residual, self.with_one_more())
-        if self.tones is None and self.has_start and not first:
+        if self.tones is None and self.start is not None and not first:
             self.open_axes = self.open_axes & self.decreases(self.weighted, residual, rough[1], share=0.25)
             if not bool(self.open_axes.any()):
                 return False

@@ -93,8 +93,7 @@ class LinearisedFit:
     """A fit linearised at its parameters, for errors of variance 1: of one axis, or of all axes together.
 
     x and y of a row are nearly independent, and each axis is a problem of its own. With roll and zoom, the components
-    of a row are strongly correlated, and X contains the parameters of all axes: the displacement along x of all rows
-    determines roll as well.
+    of a row are strongly correlated, and X contains the parameters of all axes.
     """
 
     axes: list[int]  # the A axes of the problem
@@ -126,10 +125,9 @@ class LinearisedFit:
         return 1e-12 * np.square(self.root[..., self.axes.index(axis)]).sum((1, 2))
 
     def unexplained(self, response: Array, axis: int) -> tuple[Array, Array]:
-        """Part of a response that the parameters do not explain, and their change ``X^+ Z`` (B, A M, Q) by it.
+        """Whitened part (B, D, Q) of a response that the parameters do not explain, and their change (B, A M, Q) by it.
 
-        The response (B, N, G, Q) consists of displacements of an axis in px by unit effects; the part (B, D, Q) is
-        whitened.
+        The response (B, N, G, Q) consists of displacements of an axis in px by unit effects.
         """
         root = self.root[..., self.axes.index(axis)]
         Z = root[:, :, None, :, None] * response[:, :, :, None]  # (B, N, G, A, Q)
@@ -171,7 +169,10 @@ def without_aliasing(measurements: Measurements, fit: ToneFit, size: Array) -> T
     size = np.maximum(size, 1e-9)[:, None]
     covariance, axes = fit.covariance.copy(), fit.drift.shape[1]
     change = np.zeros((len(covariance), axes, covariance.shape[-1] // axes))
-    bias = _unit_bias(measurements, fit)
+    # bias (B, N, G, A, 3) of the relative displacements for b, c and s of 1
+    turn, visible = unit_wave(2 * math.pi * displacements(measurements, fit)), measurements.visible[..., None]
+    mean = (visible * turn).sum(2, keepdims=True) / np.maximum(visible.sum(2, keepdims=True), 1.0)
+    bias = measurements.relative(np.stack([(turn * mean.conj()).imag, turn.real, turn.imag], -1))
     for axis, problem in linearised(measurements, fit)[:2]:
         Z, by_unit = problem.unexplained(bias[:, :, :, axis], axis)
         precision = 1 / np.square(size * _BIAS_STD[axis])  # (B, 3), of b, c and s before they are measured
@@ -194,10 +195,9 @@ def without_aliasing(measurements: Measurements, fit: ToneFit, size: Array) -> T
 def with_weak_aliasing(measurements: Measurements, fit: ToneFit) -> Measurements:
     """The measurements in which aliasing of single blocks of rows is weakened to their noise.
 
-    The ratio of c and s to the noise of a block is random, of a variance that all blocks of an axis have in common. It
-    is the one of the largest likelihood, given the residuals along ``cos 2 pi d`` and ``sin 2 pi d`` and across them.
-    In two frames, the difference of a block contains both, and the columns of a roll have other phases: such
-    measurements are not changed.
+    The ratio of c and s to the noise of a block is random, of a variance that all blocks of an axis have in common, the
+    one of the largest likelihood. In two frames, the difference of a block contains both, and the columns of a roll
+    have other phases: such measurements are not changed.
 
     Rms errors over the bound of 190 axes in eight frames of a camera that aliases, without and with it: amplitude 10.5,
     6.5; frequency 7.5, 4.0; standard deviations over the bound 3.6, 2.5. Of 234 axes in four frames: 8.9, 9.0; 5.2,
@@ -228,14 +228,6 @@ def with_weak_aliasing(measurements: Measurements, fit: ToneFit) -> Measurements
     return replace(weakened, displacements=weakened.relative(measurements.displacements))
 
 
-def _unit_bias(measurements: Measurements, fit: ToneFit) -> Array:
-    """Bias (B, N, G, A, 3) of the relative displacements for b, c and s of 1."""
-    turn = unit_wave(2 * math.pi * displacements(measurements, fit))
-    visible = measurements.visible[..., None]
-    mean = (visible * turn).sum(2, keepdims=True) / np.maximum(visible.sum(2, keepdims=True), 1.0)
-    return measurements.relative(np.stack([(turn * mean.conj()).imag, turn.real, turn.imag], -1))
-
-
 # --- Errors of the amplitudes ---
 
 
@@ -252,9 +244,9 @@ def with_unknown_amplitudes(
     """The fit with errors of its tones that the models of noise, unequal blur and aliasing do not contain.
 
     ``aliasing`` (B,) px is the expected size of the bias, for which ``without_aliasing`` accounts on the first
-    ``known`` axes, and ``unexplained`` (B, A) px the rms displacement of rows that nothing explains. ``intervals`` (M,)
-    are the times in s between the frames that are compared: a small gain amplifies errors of offsets. ``span`` (B,) in
-    s is the time over which errors of the phase change the frequency.
+    ``known`` axes, and ``unexplained`` (B, A) px the rms displacement of rows that nothing explains. A small gain
+    between frames ``intervals`` (M,) s apart amplifies errors of offsets. ``span`` (B,) in s is the time over which
+    errors of the phase change the frequency.
     """
     size = fit.amplitude  # (B, A, K)
     path = size * np.minimum(2 * math.pi * fit.frequencies * exposure_time, 2.0)
@@ -263,14 +255,16 @@ def with_unknown_amplitudes(
     small, large = _UNKNOWN_ALIASING
     by_aliasing = aliasing[:, None, None] * np.minimum(small, large / (size + 2 * np.square(size) + 1e-300))
     error[:, known:] = np.hypot(error, by_aliasing)[:, known:]
-    unknown = (fit.tones * error[..., None] * [1.0, 1.0, 0.0]).reshape(*size.shape[:2], -1)  # of Re C, Im C and f
-    unknown = np.pad(unknown, ((0, 0), (0, 0), (0, fit.drift.shape[-1])))  # (B, A, P)
+    of_error = fit.tones * error[..., None] * [1.0, 1.0, 0.0]  # of Re C, Im C and f
     # the bounds of Re C, Im C and f of a tone that is sampled uniformly have these proportions
     common = np.broadcast_to(_UNEXPLAINED_IN_COMMON * without_nan(unexplained, 0.0)[..., None], size.shape)
     per_size = np.divide(common, size, out=np.zeros_like(size), where=fit.active & (size > 0))
     of_frequency = math.sqrt(12) * per_size / (2 * math.pi * np.reshape(span, (-1, 1, 1)))
-    in_common = (np.stack([common, common, of_frequency], -1) * fit.active[..., None]).reshape(*size.shape[:2], -1)
-    in_common = np.pad(in_common, ((0, 0), (0, 0), (0, fit.drift.shape[-1])))
+    of_common = np.stack([common, common, of_frequency], -1) * fit.active[..., None]
+    unknown, in_common = (
+        np.pad(values.reshape(*size.shape[:2], -1), ((0, 0), (0, 0), (0, fit.drift.shape[-1])))  # (B, A, P)
+        for values in (of_error, of_common)
+    )
     covariance, (axes, parameters) = fit.covariance.copy(), unknown.shape[1:]
     diagonal = np.arange(axes * parameters)
     covariance[:, diagonal, diagonal] += np.square(in_common).reshape(len(covariance), -1)
@@ -301,11 +295,7 @@ class StatedFit:
 def with_further_tones(
     measurements: Measurements, fit: ToneFit, exposure_starts: Array, *, number_is_known: bool = False
 ) -> tuple[StatedFit, StatedFit]:
-    """The fit with slow errors in its covariance, and the same with an allowance for a further tone.
-
-    ``exposure_starts`` (N,) of the rows are in s. If the ``number_is_known``, there are no further tones; slow errors
-    remain.
-    """
+    """The fit with slow errors in its covariance, and with an allowance for a further tone; rows start at (N,) s."""
     rows = np.broadcast_to(exposure_starts, (len(fit.centre), len(exposure_starts)))
     variance = np.square(displacement_std(fit, exposure_starts, measurements.exposure_time))
     stated = [(fit.covariance.copy(), variance.copy()) for _ in range(2)]
@@ -348,9 +338,8 @@ def _added(
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     """Covariance (B, A M, A M) of the free parameters and variance (B, A) of the displacement, by tones of an axis.
 
-    By slow errors only, of (B,) px as from ``_slow_errors``, and with a further tone. The ``problem`` contains the
-    axis. ``rows`` (B, n) are exposure starts in s, ``jacobian`` (B, n, A', P) the derivatives of their displacements by
-    the parameters of each axis. Other arguments as in ``with_further_tones``.
+    By slow errors only, of (B,) px, and with a further tone. ``rows`` (B, n) are exposure starts in s, ``jacobian`` (B,
+    n, A', P) the derivatives of their displacements by the parameters of each axis.
     """
     axes = problem.axes
     of_displacement = _without_trend(jacobian[:, :, axes] @ problem.to_all, rows)
@@ -376,7 +365,10 @@ def _added(
         evidence = 0.5 * (right * v).sum(-1) - 0.5 * np.linalg.slogdet(eye + information / precision)[1]
         # 3. Displacement S of the rows by unit tones, and by the change of the parameters m that they cause: mean
         # product over the rows n for each frequency f and axis a.
-        S = _without_trend(_wave(fit, rows, chunk, measurements.exposure_time), rows)
+        time = rows + 0.5 * measurements.exposure_time - fit.centre[:, None]
+        waves = unit_wave(2 * math.pi * chunk[:, None] * time[..., None])
+        attenuation = np.sinc(chunk * measurements.exposure_time)[:, None]
+        S = _without_trend(_quadratures(attenuation * waves), rows)
         changes = split_axis(back, 1, len(axes), -1)  # (B, A, M, F, 2)
         S = S[:, :, None] * of_tone - np.einsum("bnam,bamfq->bnafq", of_displacement, changes, optimize=True)
         moved = np.einsum("bnafp,bnafq->bfapq", S, S) / S.shape[1]
@@ -410,14 +402,6 @@ def _slow_errors(measurements: Measurements, fit: ToneFit) -> Array:
 def _quadratures(response: Array) -> Array:
     """Real response (..., 2) to the real and the imaginary part of a coefficient."""
     return np.stack([response.real, -response.imag], -1)
-
-
-def _wave(fit: ToneFit, exposure_starts: Array, frequencies: Array, exposure_time: float) -> Array:
-    """(B, N, F, 2) mean displacements of exposures by unit tones."""
-    time = exposure_starts + 0.5 * exposure_time - fit.centre[:, None]
-    angle = 2 * math.pi * frequencies[:, None] * time[..., None]
-    attenuation = np.sinc(frequencies * exposure_time)[:, None]
-    return _quadratures(attenuation * unit_wave(angle))
 
 
 def _without_trend(values: Array, times: Array) -> Array:
