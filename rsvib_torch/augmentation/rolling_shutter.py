@@ -250,8 +250,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         """Record images (H, W), (C, H, W) or (B, C, H, W); the other arguments are those of Kornia's augmentations."""
         if not torch.compiler.is_compiling():
             check_tensor("input", input)
-        recorded: Tensor = super().forward(input, params, **kwargs)
-        return recorded
+        return super().forward(input, params, **kwargs)
 
     @checks_arguments
     def generate_parameters(self, batch_shape: tuple[int, ...]) -> Parameters:

@@ -128,8 +128,7 @@ def projected_information(recording: Recording, *, margin: int = _MARGIN) -> Ten
     columns = slice(recording.origin[1], recording.origin[1] + recording.size[1])
     images = torch.fft.irfft(torch.cat(residuals, dim=-1)[0].transpose(0, 1), n=length)[..., columns]  # (P, T, R, W)
     images = (images * _shown_twice(recording)).flatten(1)
-    information: Tensor = images @ images.T
-    return information
+    return images @ images.T
 
 
 def _within_band(scene: Tensor, low: float = 0.35, high: float = 0.45) -> Tensor:
@@ -138,8 +137,7 @@ def _within_band(scene: Tensor, low: float = 0.35, high: float = 0.45) -> Tensor
     spectra = torch.fft.rfft(extend_rows(scene.T, length, hold=0.0))
     v = torch.fft.rfftfreq(length, dtype=scene.dtype, device=scene.device)
     share = 0.5 + 0.5 * torch.cos(math.pi * ((v - low) / (high - low)).clamp(0.0, 1.0))
-    smooth: Tensor = torch.fft.irfft(spectra * share, n=length)[:, : len(scene)].T
-    return smooth
+    return torch.fft.irfft(spectra * share, n=length)[:, : len(scene)].T
 
 
 class _SplineKernels(RowKernels):
@@ -230,8 +228,7 @@ def gradient_information(recording: Recording, noise: float | None = None) -> Te
     mean = (seen[..., None] * sensitivity).sum(2, keepdim=True) / seen.sum(1).clamp(min=1e-300)[:, None, None]
     shared = seen * ((seen > 0).sum(1, keepdim=True) > 1)
     relative = sensitivity - mean
-    information: Tensor = torch.einsum("psta,st,sab,qstb->pq", relative, shared, products, relative)
-    return information
+    return torch.einsum("psta,st,sab,qstb->pq", relative, shared, products, relative)
 
 
 def _gradient_products(scene: Tensor, factors: Tensor, window: Tensor, noise: float | None, num_frames: int) -> Tensor:
@@ -259,8 +256,7 @@ def _gradient_products(scene: Tensor, factors: Tensor, window: Tensor, noise: fl
         weighted = images(slopes * (power / (power + noise**2 * spectrum.numel())))
     derivatives, weighted = (torch.einsum("isx,sxia->asx", values, factors) for values in (gradients, weighted))
     products = torch.einsum("asx,sx,bsx->sab", derivatives, window, weighted)
-    symmetric: Tensor = 0.5 * (products + products.transpose(-2, -1))
-    return symmetric
+    return 0.5 * (products + products.transpose(-2, -1))
 
 
 # --- Bound ---
@@ -304,8 +300,7 @@ def _deviations(information: Tensor, typical: Tensor) -> Tensor:
     shares = vectors.square()
     variance = shares @ torch.where(blind, 0.0, 1 / values.clamp(min=least))
     variance = torch.where(shares @ blind.double() > least, math.inf, variance)
-    deviations: Tensor = variance.sqrt() * scale
-    return deviations
+    return variance.sqrt() * scale
 
 
 @checks_arguments

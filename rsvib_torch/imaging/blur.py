@@ -352,7 +352,7 @@ class RowVaryingBlur(nn.Module):
 
     def A(self, x: Tensor, **kwargs: object) -> Tensor:  # noqa: N802 - name that solvers use
         """``forward`` under the name that solvers use; their further keywords are ignored."""
-        return self(x)  # type: ignore[no-any-return]
+        return self(x)
 
     def A_adjoint(self, y: Tensor, **kwargs: object) -> Tensor:  # noqa: N802 - name that solvers use
         """``adjoint`` for scenes with the leading dimensions of the frames and ``scene_size``."""

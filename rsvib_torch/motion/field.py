@@ -77,8 +77,7 @@ def largest_slope(components: Tensor, width: int, height: int, camera: Camera | 
     x, y = _corners(width, height, components)
     axes = components.shape[-1]
     along = displacement_factors(x, y, axes, camera) - displacement_factors(x - x.sign(), y, axes, camera)
-    slope: Tensor = (along.abs().amax(0) @ components[..., None])[..., 0].amax(-1)
-    return slope
+    return (along.abs().amax(0) @ components[..., None])[..., 0].amax(-1)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -155,8 +154,7 @@ class ColumnMotion(Motion):
         x, y = torch.broadcast_tensors(self.column[..., None], 0.55 * self.num_rows * nodes)
         values = torch.stack(camera.rays(x, y), -2)
         powers = nodes[:, None] ** torch.arange(degree + 1, device=self.device)
-        coefficients: Tensor = values @ torch.linalg.pinv(powers).mT
-        return coefficients
+        return values @ torch.linalg.pinv(powers).mT
 
     def _rays(self, camera: Camera, starts: Tensor, components: Tensor) -> tuple[Tensor, Tensor]:
         """Rays u and v (S) of the content of rows exposed from ``starts`` (S) on, at components (S, A)."""

@@ -276,8 +276,7 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         """R(t) alone in px; arguments and shapes as in ``displacement``."""
         times = times.to(dtype=torch.float64, device=self.device)
         taps, fraction = self._taps(times)
-        value: Tensor = (taps * bspline_weights(fraction, 3)[..., None, :]).sum(-1)
-        return value
+        return (taps * bspline_weights(fraction, 3)[..., None, :]).sum(-1)
 
     def drift(self, times: Tensor) -> Tensor:
         """Displacement of the image motion alone in px; arguments and shapes as in ``displacement``."""

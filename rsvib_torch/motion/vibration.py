@@ -547,5 +547,4 @@ def blind_frequencies(timing: SensorTiming, highest: float) -> Tensor:
     alike = multiples(float(intervals[0])) if len(intervals) else starts[:0]
     cycles = alike[:, None] * intervals
     alike = alike[((cycles - cycles.round()).abs() < 1e-6).all(-1)]  # whole cycles to the rounding of the start times
-    frequencies: Tensor = torch.cat([alike, multiples(timing.exposure_time)]).unique(sorted=True)
-    return frequencies
+    return torch.cat([alike, multiples(timing.exposure_time)]).unique(sorted=True)

@@ -239,8 +239,7 @@ def solve_halves(system: Tensor | BandedFactor, right_side: Tensor) -> Tensor:
     The systems (H + b, 2 b + 1, 2 S), as from ``from_both_ends``, are overwritten unless their gradient is required; or
     their factors, for solving several times, through which no gradient flows.
     """
-    solution: Tensor = _Solve.apply(system, right_side)  # type: ignore[no-untyped-call]
-    return solution
+    return _Solve.apply(system, right_side)  # type: ignore[no-untyped-call]
 
 
 def node_frequencies(count: int, step: float, device: torch.device) -> Tensor:

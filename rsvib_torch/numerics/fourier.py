@@ -76,8 +76,7 @@ def _mirrored_ends(width: int, extra: int) -> Array:
 def _blend(extra: int, hold: float) -> Array:
     """Share of the right end in the extension."""
     progress = ((np.arange(1, extra + 1) / (extra + 1) - hold) / (1 - 2 * hold)).clip(0, 1)
-    share: Array = 0.5 + 0.5 * np.cos(np.pi * progress)
-    return share
+    return 0.5 + 0.5 * np.cos(np.pi * progress)
 
 
 def extend_rows(images: Tensor, length: int, hold: float = 0.25) -> Tensor:

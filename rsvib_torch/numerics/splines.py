@@ -160,8 +160,7 @@ def bspline_coefficients(samples: Tensor, degree: int, dim: int) -> Tensor:
 def bspline_coefficients_adjoint(values: Tensor, degree: int, dim: int) -> Tensor:
     """Adjoint (transpose) of ``bspline_coefficients``."""
     adjoint = torch.func.vjp(partial(bspline_coefficients, degree=degree, dim=dim), torch.zeros_like(values))[1]
-    spread: Tensor = adjoint(values)[0]
-    return spread
+    return adjoint(values)[0]
 
 
 def _toeplitz(kernels: Tensor, rows: int, step: int = 1) -> Tensor:

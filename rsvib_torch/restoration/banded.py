@@ -28,8 +28,7 @@ def _spline_transfer(places: Tensor, frequencies: Tensor, degree: int) -> Tensor
     taps = torch.arange(degree + 1, dtype=places.dtype, device=places.device) - degree // 2
     at_rest = samples @ waves(taps, frequencies).real if degree > 1 else torch.ones_like(frequencies)
     weights = bspline_weights(places - cell, degree)[..., None]
-    moved: Tensor = (weights * waves(cell[..., None] + taps, frequencies)).sum(-2) / at_rest
-    return moved
+    return (weights * waves(cell[..., None] + taps, frequencies)).sum(-2) / at_rest
 
 
 _TRANSFERS: dict[str, tuple[Callable[[Tensor, Tensor], Tensor], int, Quadrature]] = {
@@ -65,8 +64,7 @@ def _filters(
     prior = 4 * (torch.sin(math.pi * v).square()[:, None] + torch.sin(math.pi * u).square())
     damped = torch.addcmul(squared_modulus(transfer), weight[:, None, None], prior)
     response = transfer.conj() / damped.clamp(min=torch.finfo(u.dtype).tiny)
-    filters: Tensor = torch.fft.ifft(response, dim=-2)
-    return filters
+    return torch.fft.ifft(response, dim=-2)
 
 
 def _aligned_spectra(frames: Tensor, motion: FrameMotion, u: Tensor, length: int) -> Tensor:
@@ -80,8 +78,7 @@ def _aligned_spectra(frames: Tensor, motion: FrameMotion, u: Tensor, length: int
         lines * waves(places, -u).to(lines.dtype)[:, None]
         for lines, places in zip(spectra.split(aligned_rows), mean.flatten().split(aligned_rows), strict=True)
     ]
-    aligned: Tensor = torch.cat(moved).unflatten(0, (B * T, H))
-    return aligned
+    return torch.cat(moved).unflatten(0, (B * T, H))
 
 
 def restore_banded(

@@ -70,8 +70,7 @@ class FrameMotion:
         times = self.frame_starts[:, None] + delays
         moved = self.vibration.drift(times.expand(len(self.shift), -1, -1)).detach()
         drift = (moved - moved[:, :, 1:2]).abs().amax((1, 2))
-        bounds: list[list[float]] = (self.vibration.largest_oscillation() + drift).tolist()
-        return bounds
+        return (self.vibration.largest_oscillation() + drift).tolist()
 
     def check_fits(self, width: int) -> None:
         """Raise a ``ValueError`` if frames of so many columns, in row order, may move by more than their own size.
@@ -113,8 +112,7 @@ class FrameMotion:
     def blur_lengths(self) -> NDArray[np.float64]:
         """Largest range (B, T, 2) of the displacement along (x, y) during the exposure of a row, in px."""
         low, high = self.exposures[0].detach().aminmax(dim=-2)
-        lengths: NDArray[np.float64] = (high - low).amax(2).cpu().numpy()
-        return lengths
+        return (high - low).amax(2).cpu().numpy()
 
 
 def frame_motion(vibration: Motion, timing: RowTiming, frames: int | Tensor, num_rows: int) -> FrameMotion:

@@ -113,14 +113,12 @@ def noise_deviation(frames: Tensor, ignore: Tensor | None) -> Array:
     variance = min(2.0 * math.prod(_correlation_area(difference) for difference in orders) / (9.0 * block**2), 0.2)
     expected = (1.0 - variance + NormalDist().inv_cdf(share) * variance**0.5) ** 3
     few = (~np.isnan(powers)).sum(-1) < 8  # too few blocks for a quantile
-    deviation: Array = np.sqrt(np.where(few, valid_mean(powers, -1), quantile(powers, share, -1) / expected))
-    return deviation
+    return np.sqrt(np.where(few, valid_mean(powers, -1), quantile(powers, share, -1) / expected))
 
 
 def _differences(count: int, order: int) -> Array:
     """Matrix (count, count + order) of differences of neighbours."""
-    matrix: Array = np.diff(np.eye(count + order), order, axis=0)
-    return matrix
+    return np.diff(np.eye(count + order), order, axis=0)
 
 
 def _correlation_area(order: int) -> float:
@@ -244,8 +242,7 @@ _SECTORS = 6  # directions, with one power law each
 def _pooled(values: Tensor) -> Tensor:
     """Mean over 2 x 2 neighbouring frequencies of (..., U, V), without the lowest and the highest u."""
     inner = values[..., 1 : (values.shape[-2] - 2) // 2 * 2 + 1, :]
-    pooled: Tensor = inner.unflatten(-2, (-1, 2)).unflatten(-1, (-1, 2)).mean((-3, -1))
-    return pooled
+    return inner.unflatten(-2, (-1, 2)).unflatten(-1, (-1, 2)).mean((-3, -1))
 
 
 def noise_of_spectral_floor(
@@ -400,5 +397,4 @@ def noise_levels(frames: Tensor, motion: FrameMotion, ignore: Tensor | None = No
 def _constant(frames: Tensor, row_step: int = 8, tolerance: float = 1e-6) -> NDArray[np.bool_]:
     """Frames (B, T) whose values, in every eighth row, are equal to within rounding: they hold not even noise."""
     low, high = tables(*frames[..., ::row_step, :].flatten(2).aminmax(dim=-1))
-    constant: NDArray[np.bool_] = high - low <= tolerance * np.maximum(-low, high)
-    return constant
+    return high - low <= tolerance * np.maximum(-low, high)

@@ -86,8 +86,7 @@ def restore_exact(
     # 5. On the finer grid, frames that contradict their scene show that the motion is wrong.
     if scale != 1:
         warn_of_frames(differences, model.places(scenes))
-    restored: Tensor = images.unflatten(0, (len(frames), -1))
-    return restored
+    return images.unflatten(0, (len(frames), -1))
 
 
 def scene_period(motion: FrameMotion, width: int) -> int:
@@ -135,8 +134,7 @@ class FrameModel:
         """Share (B, T) of the pixels of each frame that are measured."""
         if self.unknown is None:
             return np.ones(self.frames.shape[:2])
-        shares: NDArray[np.float64] = 1.0 - self.unknown.double().flatten(2).mean(2).cpu().numpy()
-        return shares
+        return 1.0 - self.unknown.double().flatten(2).mean(2).cpu().numpy()
 
     def scenes(self, groups: list[tuple[list[int], int]]) -> Scenes:
         """The scenes that are restored from groups of frames (``joint_groups``), stack after stack."""
@@ -181,8 +179,7 @@ class FrameModel:
 
     def _blur_reaches(self, scenes: Scenes) -> NDArray[np.float64]:
         """Largest distance (N,) along the row in px during an exposure from its middle."""
-        reaches: NDArray[np.float64] = 0.5 * self.motion.blur_lengths[scenes.stack[:, None], scenes.members, 0].max(1)
-        return reaches
+        return 0.5 * self.motion.blur_lengths[scenes.stack[:, None], scenes.members, 0].max(1)
 
     def strengths(self, scenes: Scenes) -> NDArray[np.float64]:
         """Factors (N,) on the priors, estimated from those frames whose columns are the same as in the restored one."""

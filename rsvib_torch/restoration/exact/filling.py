@@ -35,8 +35,7 @@ def measured_values(along: Tensor, unknown: Tensor | None, shape: torch.Size, wi
     measured = inside[:, :, None, None].expand(shape).clone()
     if unknown is not None:
         measured[..., :width] &= ~unknown
-    mask: Tensor = measured
-    return mask
+    return measured
 
 
 def with_missing_values(
@@ -62,8 +61,7 @@ def with_missing_values(
     row_weight = weight.to(data.dtype)[:, :, None, :, None]
 
     def dot(first: Tensor, second: Tensor) -> Tensor:
-        product: Tensor = (row_weight * first * second).sum((1, 2, 3, 4), keepdim=True)
-        return product
+        return (row_weight * first * second).sum((1, 2, 3, 4), keepdim=True)
 
     def prediction(solver: SceneSolver, values: Tensor) -> Tensor:
         return solver.predict(solver.fit(values))

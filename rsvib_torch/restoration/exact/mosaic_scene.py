@@ -191,8 +191,7 @@ def restore_mosaic(
             observation = FinerObservation(kernels, height, length, frames.dtype)
             images.append(part.restored(observation, shift[:, 0], stated is None, factor, partition, scale))
             advance()
-    restored: Tensor = torch.stack(images).unflatten(0, (-1, len(groups)))
-    return restored
+    return torch.stack(images).unflatten(0, (-1, len(groups)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,8 +264,7 @@ class _Frames:
         # 3. Remove the noise that is left; the points of each pixel are four images, one at a time: less memory.
         points = pixel_unshuffle(scene, scale).unflatten(0, (3, -1)).movedim(1, 0).split(1)
         points = [similar_patches(part, part, None, gain * level, rounds=2, steps=2) for part in points]
-        image: Tensor = pixel_shuffle(torch.cat(points).movedim(0, 1).flatten(0, 1), scale)
-        return image
+        return pixel_shuffle(torch.cat(points).movedim(0, 1).flatten(0, 1), scale)
 
     def _checked(self, residual: Tensor, stated: Tensor, unknown: bool, *, most: float = 1.5) -> Tensor:
         """The standard deviation of the noise to use: that of the residual if none is stated.

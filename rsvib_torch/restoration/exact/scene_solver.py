@@ -120,8 +120,7 @@ class Partition:
         if thread not in self._buffers or self._buffers[thread].numel() < prod(shape):
             self._buffers.pop(thread, None)
             self._buffers[thread] = like.new_empty(prod(shape))
-        memory: Tensor = self._buffers[thread][: prod(shape)].view(shape)
-        return memory
+        return self._buffers[thread][: prod(shape)].view(shape)
 
 
 class SceneSolver:
@@ -240,8 +239,7 @@ class SceneSolver:
     def predict(self, coefficients: Tensor) -> Tensor:
         """Noiseless frames (N, M, C, R, L) of the scenes, ``K c``."""
         spectra = [self.observation.forward(coefficients[..., part], part) for part in self.parts]  # less memory
-        images: Tensor = torch.fft.irfft(torch.cat(spectra, dim=-1), n=self.observation.period)
-        return images
+        return torch.fft.irfft(torch.cat(spectra, dim=-1), n=self.observation.period)
 
     def image(self, coefficients: Tensor) -> Tensor:
         """Rows of the scenes where the frame at rest would observe them, (N, C, R, L); twice as many if finer."""

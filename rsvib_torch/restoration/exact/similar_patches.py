@@ -70,8 +70,7 @@ def _round(images: Tensor, values: Tensor, measured: Tensor | None, level: Tenso
     def joined(parts: Tensor) -> Tensor:
         return functional.fold(parts.unflatten(0, (count, -1)).mT, (height, width), _PATCH)
 
-    image: Tensor = joined(total) / joined(weight[:, None].expand(-1, size))
-    return image
+    return joined(total) / joined(weight[:, None].expand(-1, size))
 
 
 def _references(size: int, device: torch.device) -> Tensor:

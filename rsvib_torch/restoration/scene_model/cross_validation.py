@@ -86,8 +86,7 @@ def sample_rows(
     def in_slabs(values: Tensor) -> Tensor:
         """(S M, n height, ...) as (S n M, height, ...)."""
         parts = values.unflatten(1, (slabs, height)).unflatten(0, (scenes, members))
-        joined: Tensor = parts.transpose(1, 2).flatten(0, 2)
-        return joined
+        return parts.transpose(1, 2).flatten(0, 2)
 
     # coefficients of a slab count from its first row
     first = kernels.first - height * (torch.arange(slabs * height, device=images.device) // height)
@@ -165,5 +164,4 @@ def prior_strengths(
             geometric = (np.log(explained.power) - 2 * np.log(rest)).mean(-1)
         criteria = (np.where(allowed[:tried], values + handicap[:tried], np.inf) for values in (of_sum, geometric))
         selected = np.maximum(*(criterion.argmin(0) for criterion in criteria))
-    result: NDArray[np.float64] = strengths[selected]
-    return result
+    return strengths[selected]

@@ -62,8 +62,7 @@ class FinerKernels(RowKernels):
         alias = (2 * math.pi) * self.middle[..., None, None] * both.new_tensor([[0.0], [1.0]])
         waves = torch.polar(torch.ones_like(angle), angle + alias[..., None])  # (M, R, a, N, Q)
         taps = self.taps.unflatten(-2, (-1, SCALE)).transpose(-3, -2)  # (M, R, a, J, N)
-        kernels: Tensor = (taps.to(waves.dtype) @ waves).transpose(-3, -2).flatten(-3, -2)
-        return kernels
+        return (taps.to(waves.dtype) @ waves).transpose(-3, -2).flatten(-3, -2)
 
 
 def _spline_transfer(frequencies: Tensor) -> Tensor:
@@ -141,8 +140,7 @@ class FinerObservation(Observation):
         )
         low, alias = sampled.unbind(1)  # at u and u - 1; the scene is real
         spectra = torch.cat([low, alias[..., :-1].flip(-1).conj()], dim=-1)
-        scene: Tensor = torch.fft.irfft(spectra.permute(2, 1, 0, 3), n=SCALE * self.period) * SCALE
-        return scene
+        return torch.fft.irfft(spectra.permute(2, 1, 0, 3), n=SCALE * self.period) * SCALE
 
 
 # Degree 6 instead of 4: 0.6 to 1.0 dB for eight frames of scenes with little detail beyond half a cycle per px, -0.4 dB

@@ -105,8 +105,7 @@ def cosine_series(angles: Array, values: Array, reach: int, counts: Array | floa
     """
     order = np.arange(reach + 1)
     cosines = np.cos(angles[:, None] * order) * np.where(order > 0, 2.0, 1.0)
-    half: Array = np.linalg.lstsq(cosines * np.reshape(counts, (-1, 1)), values * counts)[0]
-    return half
+    return np.linalg.lstsq(cosines * np.reshape(counts, (-1, 1)), values * counts)[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,8 +326,7 @@ def normal_matrices(
     for part in runs(taps, at_once(16 * values.numel(), nodes.device)):  # few taps at a time: less memory
         products = weighted[..., part, None, :] * values[..., None, :, :]
         bands = bands.index_add_(0, first[..., part, :].flatten(), products.flatten(0, 3))
-    normal: Tensor = _stacked(bands).view(num_scenes, count + width, diagonals, -1).permute(1, 2, 0, 3)
-    return normal
+    return _stacked(bands).view(num_scenes, count + width, diagonals, -1).permute(1, 2, 0, 3)
 
 
 class Observation:
@@ -386,8 +384,7 @@ class Observation:
 
     def A(self, coefficients: Tensor) -> Tensor:  # noqa: N802 - name that solvers use
         """Frames ``K c`` (N, M, C, R, L) of scenes with coefficients (K, C, N, U)."""
-        frames: Tensor = torch.fft.irfft(self.forward(coefficients, slice(0, len(self.u))), n=self.period)
-        return frames
+        return torch.fft.irfft(self.forward(coefficients, slice(0, len(self.u))), n=self.period)
 
     def A_adjoint(self, frames: Tensor) -> Tensor:  # noqa: N802 - name that solvers use
         """``K^H W g`` (K, C, N, U) of frames (N, M, C, R, L)."""
@@ -403,8 +400,7 @@ class Observation:
         # displacement of the middle of each row
         phases = shift_phases(self.kernels.middle, self.period, part, flat.dtype).conj()
         observed = (rows.unflatten(0, phases.shape[:2]) * phases[:, :, None]).transpose(1, 2)
-        of_scenes: Tensor = observed.unflatten(0, (self.num_scenes, -1))
-        return of_scenes
+        return observed.unflatten(0, (self.num_scenes, -1))
 
     def adjoint(self, spectra: Tensor, part: slice) -> Tensor:
         """``K^H W g``, (K, C, N, S), of the spectra (N, M, C, R, S) of rows at the frequencies ``part``."""
@@ -416,8 +412,7 @@ class Observation:
         total = rows.new_zeros(self.num_scenes * self.count, *rows.shape[1:])
         for taps, kernel in self._smooth.taps(self.u[part], conjugate=True):
             total = total.index_add_(0, self._places[taps].flatten(), (kernel[:, :, None] * rows).flatten(0, 1))
-        of_scenes: Tensor = total.unflatten(0, (self.num_scenes, -1)).movedim(0, 2)
-        return of_scenes
+        return total.unflatten(0, (self.num_scenes, -1)).movedim(0, 2)
 
     def image(self, coefficients: Tensor) -> Tensor:
         """Rows of the scenes where the frame at rest would observe them, (N, C, R, L)."""
@@ -426,11 +421,9 @@ class Observation:
         weights = constant(np.array, (scene_weights(),), dtype=near.dtype.to_real(), device=near.device)
         sampled = correlated(torch.view_as_real(near).flatten(1), weights, 0)[0]
         spectra = torch.view_as_complex(sampled.unflatten(1, (*near.shape[1:], 2)))
-        scenes: Tensor = torch.fft.irfft(spectra.permute(2, 1, 0, 3), n=self.period)
-        return scenes
+        return torch.fft.irfft(spectra.permute(2, 1, 0, 3), n=self.period)
 
 
 def frequencies_of(period: int) -> Tensor:
     """Frequencies (U,) of rows of a period in cycles per px, on the CPU."""
-    frequencies: Tensor = torch.fft.rfftfreq(period, dtype=torch.float64, device="cpu")
-    return frequencies
+    return torch.fft.rfftfreq(period, dtype=torch.float64, device="cpu")
