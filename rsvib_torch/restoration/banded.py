@@ -81,11 +81,7 @@ def _aligned_spectra(frames: Tensor, motion: FrameMotion, u: Tensor, length: int
     return torch.cat(moved).unflatten(0, (B * T, H))
 
 
-def restore_banded(
-    frames: Tensor,
-    motion: FrameMotion,
-    options: BandedOptions,
-) -> Tensor:
+def restore_banded(frames: Tensor, motion: FrameMotion, options: BandedOptions) -> Tensor:
     """Restore frames (B, T, C, H, W) slab by slab (Sec. 3.2 of Liu et al. 2023).
 
     Scene row k appears at frame row r(k). The slab of rows r(k) - l ... r(k) + l, l = ``half_rows``, is assumed to have
@@ -100,9 +96,7 @@ def restore_banded(
     interpolation, chunk_rows = options.interpolation, options.chunk_rows
     weights = _noise_to_signal(frames, options.noise_to_signal)
     B, T, C, H, W = frames.shape
-    length = extended_length(
-        W, motion.displacement_bound() + 8
-    )  # a Wiener filter extends at least 8 px beyond the displacement
+    length = extended_length(W, motion.displacement_bound() + 8)  # px by which a Wiener filter extends beyond it
     size = 2 * half_rows + 1
     u = torch.fft.rfftfreq(length, dtype=torch.float64, device=frames.device)
     v = torch.fft.fftfreq(size, dtype=torch.float64, device=frames.device)

@@ -50,6 +50,8 @@ class FrameMotion:
 
     def of(self, stacks: list[int], frames: list[int] | None = None) -> "FrameMotion":
         """The motion of some stacks of the batch, and of some of their frames; None for all."""
+        if frames is None and stacks == list(range(len(self.shift))):
+            return self
         members = slice(None) if frames is None else frames
         vibration = self.vibration.mapped(lambda values: values[stacks])
         shift = self.shift[stacks][:, members]

@@ -17,11 +17,7 @@ from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
 
 
 def restore_richardson_lucy(
-    frames: Tensor,
-    motion: FrameMotion,
-    options: RichardsonLucyOptions,
-    *,
-    ignore: Tensor | None = None,
+    frames: Tensor, motion: FrameMotion, options: RichardsonLucyOptions, *, ignore: Tensor | None = None
 ) -> Tensor:
     """Restore frames by Richardson-Lucy iterations on the row-varying blur; negative values count as 0.
 
@@ -50,13 +46,10 @@ def restore_richardson_lucy(
             first = psf.first_tap[stack, members] - shift[stack, reference]
             kernels = RowPSF(first[:, None], weights[stack, members], 1)
             elsewhere = torch.tensor([member != reference for member in members], device=frames.device)
-            beyond = elsewhere[:, None, None, None] & _depends_on_boundary(kernels, W)
-            start = _mean_of_overlap(
-                dewarped[stack, members], (shift[stack, members] - shift[stack, reference]).tolist()
-            )
-            restored.append(
-                _iterate(counts[stack, members], measured[stack, members] * ~beyond, start, kernels, iterations)
-            )
+            used = measured[stack, members] * ~(elsewhere[:, None, None, None] & _depends_on_boundary(kernels, W))
+            apart = (shift[stack, members] - shift[stack, reference]).tolist()
+            start = _mean_of_overlap(dewarped[stack, members], apart)
+            restored.append(_iterate(counts[stack, members], used, start, kernels, iterations))
     return _at_pixels(torch.cat(restored).unflatten(0, (B, len(groups))))
 
 

@@ -91,14 +91,13 @@ def restore_exact(
 
 def scene_period(motion: FrameMotion, width: int) -> int:
     """Period in px of the scenes of all stacks with frames of ``width`` px."""
-    # the boundary extension of blurred rows is filled; that of others is longer
-    is_filled = motion.blur_lengths[..., 0].max(1) > 2 * FILLED_BLUR_REACH
-    # px beyond the displacement that influence the ends
-    margins = [8 + math.ceil(bounds[0] + 0.5) for bounds in motion.bounds]
-    return max(
-        fast_length(width + 2 * margin) if filled else extended_length(width, margin)
-        for filled, margin in zip(is_filled, margins, strict=True)
-    )
+    lengths = []
+    for bounds, blur in zip(motion.bounds, motion.blur_lengths[..., 0].max(1), strict=True):
+        margin = 8 + math.ceil(bounds[0] + 0.5)  # px beyond the displacement that influence the ends
+        # the boundary extension of blurred rows is filled; that of others is longer
+        filled = blur > 2 * FILLED_BLUR_REACH
+        lengths.append(fast_length(width + 2 * margin) if filled else extended_length(width, margin))
+    return max(lengths)
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,15 +284,8 @@ def model_frames(
     if noise == "auto":
         chosen = sorted({strips // 4, strips - 1 - strips // 4})
         parts = [first + strip for first in range(0, B, strips) for strip in chosen]
-        every = strips == 1
-        measured = noise_levels(
-            frames if every else frames[parts],
-            motion if every else motion.of(parts),
-            unknown if every or unknown is None else unknown[parts],
-        )
-        powers = measured.square()
-        if not every:
-            powers = powers.unflatten(0, (-1, len(chosen))).mean(1).repeat_interleave(strips, 0)
+        measured = noise_levels(frames[parts], motion.of(parts), None if unknown is None else unknown[parts])
+        powers = measured.square().unflatten(0, (-1, len(chosen))).mean(1).repeat_interleave(strips, 0)
     else:
         powers = frames.new_full((B, T), noise**2)
     powers = powers.clamp(min=MIN_LEVEL**2)
@@ -306,9 +298,8 @@ def model_frames(
     if scale == 1:
         prior = fit_prior(frames, motion, levels, period)
     else:
-        prior = [
-            fit_polynomial_prior(frames[[stack]], motion.of([stack]), levels[[stack]], period) for stack in range(B)
-        ]
+        of_stacks = ([stack] for stack in range(B))
+        prior = [fit_polynomial_prior(frames[one], motion.of(one), levels[one], period) for one in of_stacks]
     return FrameModel(
         frames=frames,
         motion=motion,
@@ -331,9 +322,6 @@ def solve_scenes(
     """Images (N, C, S H, S W) of scenes, and, on the finer grid, the differences of the frames of each scene."""
     frames, width = model.frames, model.frames.shape[-1]
     blocks = _blocks(model, scenes)
-    threads = min(Partition.threads(frames.device), len(blocks))
-    inputs = (frames, model.motion.exposures[0])
-    differentiates = torch.is_grad_enabled() and any(value.requires_grad for value in inputs)
     found: dict[int, Tensor] = {}
     differences: list[FrameDifference] = []
     advance = steps(len(scenes.stack), "frames")
@@ -351,16 +339,16 @@ def solve_scenes(
         found.update(zip(numbers, deviations[..., : model.scale * width] + model.mean[some.stack], strict=True))
         advance(len(numbers))
 
-    if differentiates:
+    if torch.is_grad_enabled() and (frames.requires_grad or model.motion.exposures[0].requires_grad):
         for block in blocks:
             solve(block, partition)
     else:
-        # each thread has its own memory
-        partitions = [partition, *(Partition(partition.chunk, partition.segments) for _ in range(threads - 1))]
+        threads = min(Partition.threads(frames.device), len(blocks))
 
         def share(thread: int) -> None:
+            memory = replace(partition)  # each thread has its own
             for block in blocks[thread::threads]:
-                solve(block, partitions[thread])
+                solve(block, memory)
 
         in_parallel(share, range(threads), frames.device)
     return torch.stack([found[number] for number in range(len(scenes.stack))]), differences

@@ -135,11 +135,10 @@ def phase_spread(places: Tensor, frequency: float) -> Tensor:
     return 1 - mean.square()
 
 
-def warn_of_frames(differences: list[FrameDifference], places: Iterable[Tensor], *, least: float = 0.1) -> None:
+def warn_of_frames(differences: list[FrameDifference], places: Iterable[Tensor]) -> None:
     """Warn if frames on a finer grid do not fit their model, or do not sample between each other's pixels.
 
-    ``places`` are the mean displacements (M, R, 2) of the rows of the frames of each scene. ``least`` is a limit of
-    ``phase_spread`` at 1 cycle per px, the factor on the information on aliased detail: 0.5 on average for two frames.
+    ``places`` are the mean displacements (M, R, 2) of the rows of the frames of each scene.
     """
     noticed = [difference for difference in differences if difference.noticed]
     if noticed:
@@ -147,11 +146,12 @@ def warn_of_frames(differences: list[FrameDifference], places: Iterable[Tensor],
         warn_of_restoration(
             f"the frames differ from their model by {worst.residual:.1f} times the noise, rows are displaced by about "
             f"{worst.error:.2g} px more than the vibration states: it is not accurate enough for scale=2, or the scene "
-            "changes between the frames; detail between the pixels is restored only in part and may be false",
+            "changes between the frames; detail between the pixels is restored only in part and may be false"
         )
+    # the factor on the information on aliased detail: 0.5 on average for two frames
     spread = [phase_spread(place, 1.0).mean(0) for place in places]
-    if bool((torch.stack(spread).median(0).values < least).any()):
+    if bool((torch.stack(spread).median(0).values < 0.1).any()):
         warn_of_restoration(
             "the frames of a scene sample the same points of it along at least one axis: scale=2 cannot separate "
-            "detail beyond half a cycle per px from its alias there; restore more vibrating frames jointly",
+            "detail beyond half a cycle per px from its alias there; restore more vibrating frames jointly"
         )

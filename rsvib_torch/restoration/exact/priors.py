@@ -46,7 +46,7 @@ def edges(problem: SceneProblem, regularisation: float) -> Tensor:
     """
     kernels = problem.observation.kernels
     solver = replace(problem, precision=0.3 * problem.precision).solver()
-    right_side = solver.right_side(problem.data)
+    right_side = problem.observation.A_adjoint(problem.data)
     coefficients = solver.solve(right_side)
     # total weight of the frames of each scene
     weight = kernels.weight.detach().mean(-1).unflatten(0, (len(problem.data), -1)).sum(-1)

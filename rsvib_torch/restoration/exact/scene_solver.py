@@ -65,7 +65,7 @@ class Partition:
     chunk: int | None = None  # frequencies solved at a time; None: chosen by memory
     # number of windows of rows; None: as many as make a step of the elimination worth its call
     segments: int | None = None
-    _buffers: dict[int, Tensor] = field(default_factory=dict)
+    _buffers: dict[int, Tensor] = field(default_factory=dict, init=False)
 
     @staticmethod
     def threads(device: torch.device) -> int:
@@ -182,16 +182,8 @@ class SceneSolver:
 
     def fit(self, data: Tensor) -> Tensor:
         """Coefficients (K, C, N, U) of the scenes for data (N, M, C, R, L), whose rows are extended to a period."""
-        spectra: Tensor = torch.fft.rfft(data)
-        return self._solution(lambda part: self._right_side(spectra, part), spectra)
-
-    def right_side(self, data: Tensor) -> Tensor:
-        """Right sides (K, C, N, U) of the normal equations for data (N, M, C, R, L)."""
         spectra = torch.fft.rfft(data)
-        return torch.cat([self._right_side(spectra, part) for part in self.parts], dim=-1)
-
-    def _right_side(self, spectra: Tensor, part: slice) -> Tensor:
-        return self.observation.adjoint(spectra[..., part], part)
+        return self._solution(lambda part: self.observation.adjoint(spectra[..., part], part), spectra)
 
     def solve(self, right: Tensor) -> Tensor:
         """Solution (K, C, N, U) of the normal equations for right sides (K, C, N, U)."""
@@ -200,31 +192,30 @@ class SceneSolver:
     def _solution(self, right_side: Callable[[slice], Tensor], given: Tensor) -> Tensor:
         """Solution (K, C, N, U) for right sides (K, C, N, S) of parts of the frequencies, computed from ``given``."""
         interpolated: dict[int, BandedFactor] = {}  # of each thread, in memory that is used again
-        factors = self._factors if self._keep and not self._differentiates(given) else []
+        differentiates = self._differentiates(given)
+        factors = self._factors if self._keep and not differentiates else []
         scenes, windows = self.observation.num_scenes, self._windows
 
-        def solve(number: int, thread: int | None = None) -> Tensor:
+        def solve(number: int, thread: int) -> Tensor:
             part = self.parts[number]
-            u = self.u[part]
             # windows of the rows, (R, C, N W S)
             whole = right_side(part)
             right = torch.stack([whole[window] for window in windows], dim=3).flatten(2)
+            system: Tensor | BandedFactor
             if self._interpolated is not None:
-                factor = self._interpolated.at(part, None if thread is None else interpolated.get(thread))
-                if thread is not None:
-                    interpolated[thread] = factor
-                solution = solve_halves(factor, right)
+                system = self._interpolated.at(part, None if differentiates else interpolated.get(thread))
+                interpolated[thread] = system
             elif factors:
-                solution = solve_halves(factors[number], right)
+                system = factors[number]
             else:
-                left = self._normal.left
-                shape = (*left.shape[:4], len(u))
-                out = None if thread is None else self._partition.buffer(thread, shape, given)
-                solution = solve_halves(self._normal.at(u, self.precision[..., part], out), right)
+                shape = (*self._normal.left.shape[:4], part.stop - part.start)
+                out = None if differentiates else self._partition.buffer(thread, shape, given)
+                system = self._normal.at(self.u[part], self.precision[..., part], out)
+            solution = solve_halves(system, right)
             return join_windows(solution.unflatten(-1, (scenes, len(windows), -1)), windows)
 
-        if self._differentiates(given):
-            return torch.cat([solve(number) for number in range(len(self.parts))], dim=-1)
+        if differentiates:
+            return torch.cat([solve(number, 0) for number in range(len(self.parts))], dim=-1)
         channels = given.shape[-3 if given.ndim == 5 else 1]
         coefficients: Tensor = given.new_empty(self.observation.count, channels, scenes, len(self.u))
         threads = min(Partition.threads(given.device), len(self.parts))

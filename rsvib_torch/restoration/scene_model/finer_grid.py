@@ -105,9 +105,8 @@ def _laplacian_powers(count: int, order: int, device: torch.device) -> Tensor:
     powers = [torch.zeros(count, 2 * order + 1, dtype=torch.float64, device=device)]
     powers[0][:, order] = 1.0
     for _ in range(order):
-        powers.append(
-            sum((step[:, 1 + f, None] * powers[-1].roll((-f, f), (0, 1)) for f in (-1, 0, 1)), start=step.new_zeros(()))
-        )
+        above, here, below = (step[:, 1 + f, None] * powers[-1].roll((-f, f), (0, 1)) for f in (-1, 0, 1))
+        powers.append(above + here + below)
     return torch.stack(powers, dim=-1)
 
 
@@ -135,10 +134,8 @@ class FinerObservation(Observation):
         first = -SCALE * _FINER_SCENE_REACH - self.top
         count = SCALE * self.num_rows
         rows = coefficients[first : first + SCALE * (count + 2 * _FINER_SCENE_REACH)].unflatten(0, (-1, SCALE))
-        sampled = sum(
-            (weight * rows[k : k + count] for k, weight in enumerate(_finer_scene_weights())), start=rows.new_zeros(())
-        )
-        low, alias = sampled.unbind(1)  # at u and u - 1; the scene is real
+        weighted = [weight * rows[k : k + count] for k, weight in enumerate(_finer_scene_weights())]
+        low, alias = sum(weighted[1:], start=weighted[0]).unbind(1)  # at u and u - 1; the scene is real
         spectra = torch.cat([low, alias[..., :-1].flip(-1).conj()], dim=-1)
         return torch.fft.irfft(spectra.permute(2, 1, 0, 3), n=SCALE * self.period) * SCALE
 
@@ -204,9 +201,7 @@ class PolynomialPrior:
 
 
 @torch.no_grad()
-def fit_polynomial_prior(
-    frames: Tensor, motion: FrameMotion, levels: Tensor, length: int, iterations: int = 60
-) -> PolynomialPrior:
+def fit_polynomial_prior(frames: Tensor, motion: FrameMotion, levels: Tensor, length: int) -> PolynomialPrior:
     """Fit the prior to the frames (1, T, C, H, W) of one stack in row order, whose spectrum is blurred and aliased.
 
     The expected power of a frame at (u, v) is that of the noise (1, T) plus that of the scene, through the blur of the
@@ -215,9 +210,8 @@ def fit_polynomial_prior(
     """
     spectrum = observed_spectrum(frames, motion, levels, length)
     u, v = spectrum.u[:, None], spectrum.v
-    observed, weight, noise = (
-        values[0] for values in spectrum.weighted(smeared(spectrum.blur(spectrum.u, spectrum.v)))
-    )
+    transfer = smeared(spectrum.blur(spectrum.u, spectrum.v))
+    observed, weight, noise = (values[0] for values in spectrum.weighted(transfer))
     # transfer function and powers of the Laplacians at each alias
     gains, features = [], []
     rising, order = _rising_powers(frames.device), torch.arange(_DEGREE + 1, device=frames.device)
@@ -236,7 +230,7 @@ def fit_polynomial_prior(
     # start from a white spectrum of the mean level
     middle = (observed - noise).clamp(min=0.01 * noise)[used].log().mean().exp()
     logs = torch.full((len(_POWERS),), -float(middle.log()), dtype=torch.float64, device=frames.device)
-    for _ in range(iterations):
+    for _ in range(60):
         # expected power of the frames, and its derivative with respect to the logarithms
         terms = feature * logs.exp()
         polynomial = terms.sum(-1)

@@ -205,32 +205,6 @@ def _stacked(values: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False)
-class SmoothKernels:
-    """Kernels at any frequencies by one matrix product."""
-
-    left: Tensor  # (J, M R, 2 Q) real and imaginary parts at Q nodes of every tap of every row
-    reach: float  # largest distance along the rows in px from their middles
-    symmetric: bool = True  # whether kernels at -u are the conjugates of those at u
-
-    def taps(self, u: Tensor, *, conjugate: bool = False) -> Iterator[tuple[slice, Tensor]]:
-        """Kernels (j, M R, U) of some taps, or their conjugates, without the phase of their middles: less memory."""
-        right = interpolation_matrix(self.reach, u, self.left.dtype, symmetric=self.symmetric)[1]
-        if conjugate:
-            right[:, 1::2].neg_()
-        right = right.to(self.left)
-        count = at_once(self.left.element_size() * self.left[0, :, 0].numel() * right.shape[1], right.device)
-        for part in runs(len(self.left), count):
-            yield part, torch.view_as_complex((self.left[part] @ right).unflatten(-1, (-1, 2)))
-
-
-def smooth_kernels(kernels: RowKernels, dtype: torch.dtype) -> SmoothKernels:
-    """Kernels of all rows at the Chebyshev nodes."""
-    nodes, _ = interpolation_matrix(kernels.blur_reach, None, dtype, symmetric=kernels.symmetric)
-    left = _stacked(kernels.at(nodes.to(kernels.middle.device))).to(dtype).flatten(0, 1).transpose(0, 1).contiguous()
-    return SmoothKernels(left, kernels.blur_reach, kernels.symmetric)
-
-
-@dataclass(frozen=True, eq=False)
 class SmoothBand:
     """Normal matrices of N scenes at any frequencies by one matrix product, to which the prior is added."""
 
@@ -352,7 +326,10 @@ class Observation:
         lowest, highest = torch.stack(kernels.first.aminmax()).tolist()
         self.top = min(lowest, first)
         self.count = max(highest + kernels.taps.shape[-2], last) - self.top
-        self._smooth = smooth_kernels(kernels, dtype)
+        # real and imaginary parts of every tap of every row (J, N M R, 2 Q) at Q Chebyshev nodes
+        nodes, _ = interpolation_matrix(kernels.blur_reach, None, dtype, symmetric=kernels.symmetric)
+        at_nodes = _stacked(kernels.at(nodes.to(kernels.middle.device))).to(dtype)
+        self._at_nodes = at_nodes.flatten(0, 1).transpose(0, 1).contiguous()
         scene = torch.arange(num_scenes, device=kernels.first.device)[:, None, None]
         place = kernels.first.unflatten(0, (num_scenes, -1)) - self.top + self.count * scene
         # coefficients of the taps of each row (J, N M R), of all scenes one after the other
@@ -382,6 +359,20 @@ class Observation:
         other.period, other.u = period, u
         return other
 
+    def _taps(self, part: slice, *, conjugate: bool = False) -> Iterator[tuple[Tensor, Tensor]]:
+        """Places (j, N M R) of a few taps at a time, which need less memory, and their kernels (j, N M R, S).
+
+        The kernels, or their conjugates, are without the phase of the middle.
+        """
+        left, reach, symmetric = self._at_nodes, self.kernels.blur_reach, self.kernels.symmetric
+        right = interpolation_matrix(reach, self.u[part], self.dtype, symmetric=symmetric)[1]
+        if conjugate:
+            right[:, 1::2].neg_()
+        right = right.to(left)
+        count = at_once(left.element_size() * left.shape[1] * right.shape[1], left.device)
+        for taps in runs(len(left), count):
+            yield self._places[taps], torch.view_as_complex((left[taps] @ right).unflatten(-1, (-1, 2)))
+
     def A(self, coefficients: Tensor) -> Tensor:  # noqa: N802 - name that solvers use
         """Frames ``K c`` (N, M, C, R, L) of scenes with coefficients (K, C, N, U)."""
         return torch.fft.irfft(self.forward(coefficients, slice(0, len(self.u))), n=self.period)
@@ -395,8 +386,8 @@ class Observation:
         # sum over the taps of each row of all frames
         flat = coefficients.movedim(2, 0).flatten(0, 1)
         rows = flat.new_zeros(self._places.shape[1], *flat.shape[1:])
-        for taps, kernel in self._smooth.taps(self.u[part]):
-            rows = rows + (kernel[:, :, None] * flat[self._places[taps]]).sum(0)
+        for places, kernel in self._taps(part):
+            rows = rows + (kernel[:, :, None] * flat[places]).sum(0)
         # displacement of the middle of each row
         phases = shift_phases(self.kernels.middle, self.period, part, flat.dtype).conj()
         observed = (rows.unflatten(0, phases.shape[:2]) * phases[:, :, None]).transpose(1, 2)
@@ -410,8 +401,8 @@ class Observation:
         rows = (spectra.flatten(0, 1) * phases[:, None]).transpose(1, 2).flatten(0, 1)
         # each row contributes to the scene rows of its taps
         total = rows.new_zeros(self.num_scenes * self.count, *rows.shape[1:])
-        for taps, kernel in self._smooth.taps(self.u[part], conjugate=True):
-            total = total.index_add_(0, self._places[taps].flatten(), (kernel[:, :, None] * rows).flatten(0, 1))
+        for places, kernel in self._taps(part, conjugate=True):
+            total = total.index_add_(0, places.flatten(), (kernel[:, :, None] * rows).flatten(0, 1))
         return total.unflatten(0, (self.num_scenes, -1)).movedim(0, 2)
 
     def image(self, coefficients: Tensor) -> Tensor:
