@@ -70,18 +70,6 @@ def _interpolation(length: int, count: int) -> tuple[Array, Array]:
     return 0.5 * (length - 1) * (nodes + 1), weights.T
 
 
-def source_map(
-    motion: Motion,
-    timing: SensorTiming,
-    size: tuple[int, int],
-    frame: int = 0,
-    shift: Tensor | None = None,
-    dtype: Any = np.float32,
-) -> Array:
-    """(2, H, W) px, the place (x, y) in a frame where each pixel of the restored frame was recorded."""
-    return places(*recorded_offsets(motion, timing, size, frame, shift), timing, size, dtype)
-
-
 def places(
     offsets: Array, weights: Array, timing: SensorTiming, size: tuple[int, int], dtype: Any = np.float32
 ) -> Array:

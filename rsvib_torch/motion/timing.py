@@ -112,12 +112,10 @@ class SensorTiming:
         if type(self.scan_axis) not in (int, str) or self.scan_axis not in _SCAN_AXES:
             raise ValueError(f"scan_axis must be -2 ('y') or -1 ('x'), got {described(self.scan_axis)}")
         check_choice("readout_direction", self.readout_direction, ("forward", "reverse"))
-        row_time_std = check_number("row_time_std", self.row_time_std, at_least=0.0, at_most=row_time)
-        object.__setattr__(self, "row_time_std", row_time_std)
-        object.__setattr__(self, "row_time", row_time)
-        object.__setattr__(self, "exposure_rows", exposure_rows)
-        object.__setattr__(self, "frame_rows", frame_rows)
-        object.__setattr__(self, "scan_axis", _SCAN_AXES[self.scan_axis])
+        checked = {"row_time": row_time, "exposure_rows": exposure_rows, "frame_rows": frame_rows}
+        checked["row_time_std"] = check_number("row_time_std", self.row_time_std, at_least=0.0, at_most=row_time)
+        for name, value in (checked | {"scan_axis": _SCAN_AXES[self.scan_axis]}).items():
+            object.__setattr__(self, name, value)
         if self.frame_start_times is not None:
             from rsvib_torch.checks.arguments import as_numbers  # noqa: PLC0415
 
@@ -155,15 +153,8 @@ class SensorTiming:
         row_time = check_number("row_time", row_time, above=0.0)
         exposure = check_number("exposure_time", exposure_time, above=0.0)
         period = 1 / check_number("frame_rate", frame_rate, above=0.0)
-        return cls(
-            row_time,
-            exposure / row_time,
-            period / row_time,
-            scan_axis,
-            readout_direction,
-            frame_start_times,
-            row_time_std,
-        )
+        others = scan_axis, readout_direction, frame_start_times, row_time_std
+        return cls(row_time, exposure / row_time, period / row_time, *others)
 
     @staticmethod
     def from_file(path: str | os.PathLike[str]) -> SensorTiming:
@@ -208,12 +199,7 @@ class SensorTiming:
         check_number("exposure_lines", exposure_lines, above=0.0)
         if not isinstance(delays, Sequence) or len(delays) < 2:
             raise ValueError(f"delays must have at least two entries, got {described(delays)}")
-        return cls(
-            row_time=line_time,
-            exposure_rows=exposure_lines,
-            frame_rows=max(lines, exposure_lines),
-            frame_start_times=tuple(delays),
-        )
+        return cls(line_time, exposure_lines, max(lines, exposure_lines), frame_start_times=tuple(delays))
 
     @property
     def exposure_time(self) -> float:

@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from typing import Self
 
 import torch
@@ -83,42 +82,25 @@ def _with_trailing(value: float | Tensor, dimensions: int) -> float | Tensor:
     return value[(..., *(None,) * dimensions)] if isinstance(value, Tensor) else value
 
 
-@lru_cache(maxsize=64)
-def _ranges(counts: tuple[tuple[str, int], ...], device: torch.device) -> tuple[Tensor, Tensor]:
-    """Number of values of each quantity, and its smallest and largest permitted value (2, n); do not modify them."""
-    with torch.inference_mode(False):
-        numbers = torch.tensor([count for _, count in counts], device=device)
-        high = [_LIMITS[name] for name, _ in counts]
-        low = [0.0 if name in _NOT_NEGATIVE else -_LIMITS[name] for name, _ in counts]
-        return numbers, torch.tensor([low, high], dtype=torch.float64, device=device)
-
-
 def _check_values(values: dict[str, Tensor]) -> None:
     """Raise a ValueError for values that are not finite or too large, and for negative amplitudes or frequencies."""
-    flat = torch.cat([tensor.detach().flatten() for tensor in values.values()])
-    numbers, ranges = _ranges(tuple((name, tensor.numel()) for name, tensor in values.items()), flat.device)
-    low, high = ranges.repeat_interleave(numbers, dim=1, output_size=len(flat))
-    if bool(((flat >= low) & (flat <= high)).all()):  # of all values at once: the tracker checks many small motions
-        return
-    for name, tensor in values.items():
-        if not bool(torch.isfinite(tensor).all()):
+    # one transfer: the smallest and the largest value of each quantity that is not empty, NaN if one is
+    ends = {name: torch.stack(tensor.detach().aminmax()) for name, tensor in values.items() if tensor.numel()}
+    for name, (low, high) in zip(ends, torch.stack([*ends.values()]).tolist() if ends else (), strict=True):
+        limit = _LIMITS[name]
+        if not (math.isfinite(low) and math.isfinite(high)):
             raise ValueError(f"{name} must be finite")
-        if bool((tensor.abs() > _LIMITS[name]).any()):
-            raise ValueError(
-                f"{name} must be at most {_LIMITS[name]:g} {_UNITS[name].partition(' at')[0]}, got "
-                f"{tensor.abs().max().item():g}"
-            )
-    for name in _NOT_NEGATIVE:
-        if bool((values[name] < 0).any()):
-            raise ValueError(f"{name} must not be negative, got {values[name].min().item():g}")
+        if max(-low, high) > limit:
+            unit = _UNITS[name].partition(" at")[0]
+            raise ValueError(f"{name} must be at most {limit:g} {unit}, got {max(-low, high):g}")
+        if name in _NOT_NEGATIVE and low < 0:
+            raise ValueError(f"{name} must not be negative, got {low:g}")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 @checked_methods
 class Vibration(
-    Motion,
-    units=_UNITS,
-    shapes={**dict.fromkeys(_QUANTITIES, "... A=2-4 K"), **dict.fromkeys(_POLYNOMIAL, "... A")},
+    Motion, units=_UNITS, shapes={**dict.fromkeys(_QUANTITIES, "... A=2-4 K"), **dict.fromkeys(_POLYNOMIAL, "... A")}
 ):
     """Sinusoidal displacement of the image on the sensor, with an image motion.
 
@@ -195,9 +177,8 @@ class Vibration(
         if tones[0].shape[-1] > 1:  # sorted
             order = tones[0].detach().argsort(dim=-1, descending=True, stable=True)
             tones = [tensor.take_along_dim(order, dim=-1) for tensor in tones]
-        for name, tensor in zip(
-            _LIMITS, (*tones, *(values.expand(*batch, axes) for values in polynomial)), strict=True
-        ):
+        polynomial = [values.expand(*batch, axes) for values in polynomial]
+        for name, tensor in zip(_LIMITS, (*tones, *polynomial), strict=True):
             object.__setattr__(self, name, tensor)
         object.__setattr__(self, "camera", camera)
 
@@ -314,8 +295,7 @@ class Vibration(
 
     def _at(self, times: Tensor, values: Tensor) -> Tensor:
         """Values (..., A) for each motion, to broadcast with times (S, 1)."""
-        shape = (*self.batch_shape, *(1,) * (times.ndim - 1 - len(self.batch_shape)), self.amplitude.shape[-2])
-        return values.reshape(shape)
+        return values.reshape(*self.batch_shape, *(1,) * (times.ndim - 1 - len(self.batch_shape)), -1)
 
     def drift(self, times: Tensor) -> Tensor:
         """Displacement v t + a t^2 / 2 of the image motion alone in px; arguments and shapes as in ``displacement``."""
@@ -362,9 +342,7 @@ class Vibration(
         return self.amplitude.detach().sum(-1) + self.image_shift.detach().abs()
 
     def displacement_within(self, duration: float) -> Tensor:
-        """Bound on the displacement between two times ``duration`` apart, (..., 2), in px (Eq. 24, sum of tones).
-
-        Beyond half a period a tone counts with its path length 4 A per period. Image motion counts with its velocity.
+        """Bound on the displacement between two times as in ``Motion.displacement_within`` (Eq. 24, sum of tones).
 
         Condition (24): the discrete point spread function of Eqs. (25)-(39) requires less than 0.1 px in a row time.
         """
@@ -489,8 +467,8 @@ def tone_rows(
 ) -> list[tuple[tuple[int, ...], list[str]]]:
     """Rows of a table of tones: the index (..., axis, tone) in the tensors, and the cells of the ``quantities``.
 
-    Standard deviations if a further tone is hidden are added
-    where they are larger, but for phases: a line of a terminal has 80 characters.
+    Standard deviations if a further tone is ``hidden`` are added where they are larger, but for phases: a line of a
+    terminal has 80 characters.
     """
     rows = []
     for at, labels in tone_places(vibration):

@@ -26,7 +26,7 @@ from rsvib_torch.frames.prepare import PreparedFrames
 from rsvib_torch.imaging.trajectory import exposure_trajectory, rows_and_displacement
 from rsvib_torch.motion.field import ColumnMotion, largest_in_frame, largest_slope
 from rsvib_torch.motion.motion import Motion
-from rsvib_torch.motion.sampling import source_map
+from rsvib_torch.motion.sampling import places, recorded_offsets
 from rsvib_torch.motion.timing import MAX_ROWS, RowTiming, SensorTiming
 
 
@@ -192,8 +192,9 @@ def visible_pixels(
         of_frames.check_fits(columns)
         for frame in range(num_frames):
             # the place in the frame where each pixel of the restored frame was recorded
-            places = source_map(motion, timing, (height, width), frame, shift[frame], np.float64)
-            masks.append(((places >= 0) & (places <= limits)).all(0))
+            offsets, weights = recorded_offsets(motion, timing, (height, width), frame, shift[frame])
+            recorded = places(offsets, weights, timing, (height, width), np.float64)
+            masks.append(((recorded >= 0) & (recorded <= limits)).all(0))
         shifts.append(shift)
     mask = torch.from_numpy(np.stack(masks)).to(vibration.device)
     return mask.view(*batch, num_frames, height, width), torch.stack(shifts).view(*batch, num_frames, 2)
