@@ -208,7 +208,7 @@ def _plan_buildings(
     """Rows of buildings along the streets of every town and works district, and a few farms in the fields.
 
     The (N, 8) values are centre x and y, half of the two sides, direction of the first side in rad, tone of the roof,
-    length of the shadow, all lengths in px, and 1 where the two sides of the roof differ in tone, 0 where it is flat.
+    length of the shadow, all lengths in px, and 1 for a gabled roof, 0 for a flat one.
     """
     kinds = enumerate(districts.kind.view(-1).tolist())
     plans = [_plan_district(index, kind, districts, lines, generator) for index, kind in kinds if kind != _WOOD]

@@ -199,10 +199,9 @@ def gradient_information(recording: Recording, noise: float | None = None) -> Te
     """The information in closed form, row by row, for unit noise.
 
     ``J = sum_s sum_p (d_p - d)' M(s) (d_p - d)``: M(s) sums the gradient products of scene row s, d_p are the
-    derivatives of its displacement in frame p and d their mean. For two frames this is half of what the derivatives of
-    the offset give. Blur within the exposure and the extent of interpolation kernels are neglected. With the standard
-    deviation of the ``noise``, gradients are weighted by ``T S / (T S + N)``, which is small for frequencies below the
-    noise: the scene is a random Gaussian one with the power spectrum S of this one, N is the power of the noise.
+    derivatives of its displacement in frame p and d their mean. Blur within the exposure and the extent of
+    interpolation kernels are neglected. With the standard deviation of the ``noise``, gradients are weighted by ``T S /
+    (T S + N)``: the scene is a random Gaussian one with the power spectrum S of this one, N is the power of the noise.
     Without it, the scene is unknown and deterministic.
     """
     timing, count = recording.timing, recording.num_frames

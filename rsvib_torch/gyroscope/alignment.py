@@ -346,10 +346,7 @@ def best_offset(
 def fit_clock(
     measured: Measurements, recorded: FreeMotion, clock: FittedClock, fit_scale: bool, fit_gain: bool
 ) -> tuple[FittedClock, Array]:
-    """Gauss-Newton on clock reading, scale, gain and drift, from start values.
-
-    Returns the fitted values and their covariance (6, 6): clock reading, scale, gain and drift of x and y.
-    """
+    """Gauss-Newton on clock reading, scale, gain and drift, from start values; also their covariance (6, 6)."""
     starts = measured.exposure_starts
     free = np.array([True, fit_scale, fit_gain, fit_gain, True, True])
     for _ in range(12):

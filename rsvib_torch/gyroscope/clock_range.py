@@ -7,10 +7,7 @@ from rsvib_torch.results.reason import Reason
 def offset_range(
     start: float, end: float, first: float, last: float, limits: tuple[float, float] | None
 ) -> tuple[float, float]:
-    """Range of offsets in s, within ``limits``, for which a recording covers the time from ``first`` to ``last``.
-
-    The recording is from ``start`` to ``end`` on its own clock.
-    """
+    """Range of offsets in s, within ``limits``, for which a recording covers the time from ``first`` to ``last``."""
     low, high = start - first, end - last
     if high < low:
         raise ValueError(

@@ -72,9 +72,9 @@ class CameraTrack:
 
 
 def read_camera_track(path: Path) -> CameraTrack | None:
-    """What the GPMF track of a video states about its frames; None for other files, without one, or a damaged one.
+    """What the GPMF track of a video states about its frames; None for other files and without a track.
 
-    A damaged one causes a ``UserWarning``.
+    A damaged one causes a ``UserWarning``, and is not used.
     """
     if not path.is_file():
         return None
@@ -245,11 +245,10 @@ def _part(stream: bytes, packet: _Packet, earliest: float | None) -> _Part | Non
 def _sample_times(parts: list[_Part]) -> Array:
     """Times (N,) in s of the samples of all packets.
 
-    As in ``GetGPMFSampleRate`` of gpmf-parser, the reference implementation of the manufacturer: the clock of stamps
-    (STMP) starts anywhere, and the earliest stamp of the first packet is the start of that packet. Without stamps, the
-    samples up to the end of a packet were taken until then, and the gyroscope is regular: a straight line. The first
-    packet may begin late, and the last may end early. Ticks (TICK) are not used: they are times of the operating
-    system (gpmf-parser issue 63), in ms.
+    As in ``GetGPMFSampleRate`` of gpmf-parser, the reference implementation: the clock of stamps (STMP) starts
+    anywhere, and the earliest stamp of the first packet is the start of that packet. Without stamps, the samples up to
+    the end of a packet were taken until then: a straight line. The first packet may begin late, and the last may end
+    early. Ticks (TICK) are not used: they are times of the operating system in ms (gpmf-parser issue 63).
     """
     counts = np.array([len(part.rates) for part in parts])
     ends = np.cumsum(counts)

@@ -150,12 +150,7 @@ def _running_product(quaternions: Array) -> Array:
 
 
 def orientation_matrix(name: str) -> Tensor:
-    """(3, 3) matrix from rates about the axes of the gyroscope to those about the axes of the camera.
-
-    Example:
-        >>> orientation_matrix("YxZ").tolist()
-        [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
-    """
+    """(3, 3) matrix from rates about the axes of the gyroscope to those about the axes of the camera, e.g. "YxZ"."""
     matrix = torch.zeros(3, 3, dtype=torch.float64, device="cpu")
     for row, letter in enumerate(name):
         matrix[row, "xyz".index(letter.lower())] = 1.0 if letter.isupper() else -1.0

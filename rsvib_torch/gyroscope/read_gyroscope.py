@@ -20,11 +20,7 @@ RateUnit = Literal["rad/s", "deg/s"]
 
 @dataclass(frozen=True)
 class _GyroscopeFormat:
-    """A format of gyroscope files.
-
-    ``read`` refuses damaged files with a one-line ``ValueError``; its time and memory are linear in the size of the
-    file.
-    """
+    """A format of gyroscope files, whose ``read`` refuses damaged files with a one-line ``ValueError``."""
 
     name: str  # in messages
     matches: Callable[[bytes], bool]  # whether the first 64 bytes of a file are those of this format

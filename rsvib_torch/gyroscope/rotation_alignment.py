@@ -153,9 +153,9 @@ def align_rates(
     fit_focal_length: bool = True,
     fit_row_time: bool = False,
 ) -> RotationAlignment:
-    """``align_motion`` for angular rates, from the corners of pairs of frames.
+    """``align_motion`` for angular rates, from the corners of pairs of frames of ``size`` (rows, pixels of a row).
 
-    The frames have ``size`` (rows, pixels of a row); their exposures start at ``starts`` (P, 2) in s.
+    The exposures of the frames of each pair start at ``starts`` (P, 2) in s.
     """
     height, width = size
     if camera is not None:

@@ -185,10 +185,10 @@ def form_rows(
 ) -> Tensor:
     """Form rows of frames from the spectra of the rows of a scene, which is mirrored beyond its first and last row.
 
-    The ``spectra`` (..., S, U) are those of B-spline coefficients, of ``degree`` across the rows. ``places`` (..., R,
-    N) are scene rows at the nodes of the exposures of R rows, and ``along`` (..., R, N) displacements along the rows in
-    px; ``node_weights`` (N,) sum to 1; frequencies (U,) are in cycles per px. The rows of several scenes follow each
-    other in ``spectra``; places and displacements are then (B, R, N).
+    The ``spectra`` (..., S, U) are those of B-spline coefficients, of ``degree`` across the rows; the rows of several
+    scenes follow each other. ``places`` (..., R, N) are scene rows at the nodes of the exposures of R rows, and
+    ``along`` (..., R, N) displacements along the rows in px, (B, R, N) for several scenes; ``node_weights`` (N,) sum to
+    1; frequencies (U,) are in cycles per px.
     """
     first, taps = row_taps(places, node_weights, partial(bspline_weights, degree=degree))
     source = first[..., None] + torch.arange(-(degree // 2), taps.shape[-2] - degree // 2, device=first.device)

@@ -136,8 +136,8 @@ def simulate_frames(
 def _form_frames(scene: Tensor, starts: Tensor, timing: RowTiming, motion: Motion, width: int) -> Tensor:
     """``_form_rows``, in strips of columns if the motion has roll or zoom.
 
-    The displacement differs between neighbouring strips by at most ``_SLIDE``, for example 16 px with a roll of 2 mrad;
-    the linear interpolation between them has then errors of up to 2e-4 of full scale (rms).
+    The displacement of neighbouring strips differs by at most ``_SLIDE``, for example 16 px apart with a roll of 2
+    mrad; the linear interpolation between them has errors of up to 2e-4 of full scale (rms).
     """
     if motion.same_for_all_columns:
         return _form_rows(scene, starts, timing, motion, width)

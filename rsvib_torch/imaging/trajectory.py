@@ -26,9 +26,6 @@ def gauss_node_count(vibration: Motion, exposure_time: float, *, at_most: int = 
 
     The integrand is ``exp(-2 pi i (u X(t) + v Y(t)))`` with frequencies up to half a cycle per pixel, so the count
     grows with the path length (two nodes per px) and with the periods of the fastest tone (four nodes each).
-
-    Raises:
-        ValueError: If more than ``at_most`` nodes are necessary.
     """
     path = float(vibration.displacement_within(exposure_time).amax())
     periods = float(vibration.periods_within(exposure_time).amax())
@@ -123,9 +120,9 @@ def shown_by_tones(
 ) -> tuple[Tensor, Tensor]:
     """``rows_showing`` for vibrations, with displacements along x: rows and px (B, G, S) of scene rows (B, 1, S).
 
-    The displacement of few rows by vibrations (B) in row order is computed in NumPy, because each step of Newton's
-    method takes 60 operations of PyTorch; without gradients. Its slope is that of the mean displacement.
-    ``frame_start`` (B, G, 1) are the exposure starts in s of the first rows of the frames.
+    The displacement of few rows is computed in NumPy, because each step of Newton's method takes 60 operations of
+    PyTorch; without gradients. Its slope is that of the mean displacement. ``frame_start`` (B, G, 1) are the exposure
+    starts in s of the first rows of the frames.
     """
     values, scene, start = tables(vibration.parameters, scene_rows, frame_start)
     amplitude, frequency, phase = np.split(values[..., :-3], 3, -1)

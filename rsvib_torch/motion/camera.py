@@ -223,12 +223,9 @@ class Camera:
             )
 
     def displacement(self, components: Tensor, x: Tensor, y: Tensor) -> Tensor:
-        """Displacement (S, 2) in px of content at (x, y) px (S) from the centre, by components (S, A) of a motion.
+        """Displacement (S, 2) in px of content at rest at (x, y) px (S) from the centre, by components (S, A).
 
-        Args:
-            components: X and Y in px, roll theta in rad and zoom, A = 2 to 4.
-            x: px, position at rest.
-            y: The same along y.
+        The components are X and Y in px, roll theta in rad and zoom, A = 2 to 4.
         """
         check_broadcast(components=_first(components), x=x, y=y)
         return self.displacement_of_rays(components, *self.rays(x.to(components), y.to(components)))

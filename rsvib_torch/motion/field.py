@@ -30,10 +30,6 @@ def displacement_factors(x: Tensor, y: Tensor, axes: int, camera: Camera | None 
     """Displacement by unit components at positions of the scene: ``((1, 0, -y, x), (0, 1, x, y))``, (S, 2, A).
 
     Positions (S) are in px from the centre of the frame. With a camera, the factors are those of small angles.
-
-    Example:
-        >>> displacement_factors(torch.tensor(100.0), torch.tensor(-50.0), 3).tolist()
-        [[1.0, 0.0, 50.0], [0.0, 1.0, 100.0]]
     """
     if camera is not None:
         return camera.factors(x, y, axes)

@@ -178,15 +178,13 @@ class SensorTiming:
     ) -> SensorTiming:
         """Timing of images of the same ground from several lines (or bands) of a push-broom sensor.
 
-        Every image is recorded line by line while the ground moves; each line records the same ground after its own
-        delay. Registered to the ground, the images are frames of a rolling shutter whose exposures start after these
-        delays: the jitter of the platform is estimated from parallax pairs, except at frequencies that are multiples of
-        one over all delays.
+        Each line records the same ground line by line after its own delay. Registered to the ground, the images are
+        frames of a rolling shutter whose exposures start after these delays: the jitter of the platform is estimated
+        from parallax pairs, except at frequencies that are multiples of one over all delays.
 
         Args:
             line_time: Time between lines, in seconds.
-            delays: Delay in seconds between the recording of the ground by the first line and by each line,
-                increasing; 0 for the first.
+            delays: Delay in s of the recording of the ground by each line, increasing; 0 for the first.
             num_lines: Number of lines of the images.
             exposure_lines: Exposure in line times, including the stages of time-delayed integration.
 
@@ -260,8 +258,7 @@ class SensorTiming:
     def check_span(self, num_frames: int, num_rows: int) -> None:
         """Raise a ``ValueError`` if frames are too far apart for their number of rows to resolve frequencies.
 
-        Between two frames, a vibration has a number of periods that its frequency must determine: the number of
-        frequencies that are tried, and the time and memory that they take, grow with the span.
+        The number of frequencies that are tried, and the time and memory that they take, grow with the span.
         """
         check_whole_number("num_rows", num_rows, at_least=1)
         starts = self.frame_starts(num_frames)
@@ -374,8 +371,8 @@ class _SensorFile:
 class RowTiming(SensorTiming):
     """Timing of frames in row order: rows lie on axis -2, and row 0 is read first.
 
-    ``SensorTiming.in_row_order`` returns it. Functions that work on frames, offsets or motions in row order take it
-    instead of a ``SensorTiming``, so that a type checker refuses a timing whose frames have not been turned.
+    ``SensorTiming.in_row_order`` returns it. Functions of frames, offsets or motions in row order take it, so that a
+    type checker refuses a timing whose frames have not been turned.
     """
 
     def __post_init__(self) -> None:
@@ -397,13 +394,8 @@ def check_timing(value: object) -> None:
 def row_axes(timing: SensorTiming, num_axes: int) -> tuple[list[int], list[float]]:
     """Order and signs of the components of a motion when frames are turned to row order.
 
-    Transposing frames exchanges x and y; flipping them along the rows changes the sign of y. Both are reflections and
-    change the sign of roll. Component i in row order is component ``order[i]`` in image axes times ``signs[i]``.
-
-    Example:
-        >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512, scan_axis="x")
-        >>> row_axes(timing, 3)
-        ([1, 0, 2], [1.0, 1.0, -1.0])
+    Transposing frames exchanges x and y; flipping them along the rows changes the sign of y. Both change the sign of
+    roll. Component i in row order is component ``order[i]`` in image axes times ``signs[i]``.
     """
     transposed, reverse = timing.scan_axis == -1, timing.readout_direction == "reverse"
     order = [1, 0, 2, 3] if transposed else [0, 1, 2, 3]

@@ -196,9 +196,8 @@ class Vibration(
     def from_parameters(cls, parameters: Tensor) -> Self:
         """A batch of vibrations from one tensor, without checks and without another order of the tones.
 
-        Args:
-            parameters: (B, A, 3 K + 3) float64: amplitudes, frequencies and phases of the K tones, largest first, then
-                image motion, image acceleration and image shift.
+        The parameters are (B, A, 3 K + 3) float64: amplitudes, frequencies and phases of the K tones, largest first,
+        then image motion, image acceleration and image shift.
         """
         tones = (parameters.shape[-1] - 3) // 3
         *of_tones, polynomial = parameters.split([tones, tones, tones, 3], -1)
@@ -351,9 +350,9 @@ class Vibration(
         return ((self.amplitude * path).sum(-1) + self.image_motion.abs() * duration).detach()
 
     def periods_within(self, duration: float) -> Tensor:
-        """Periods of the fastest tone in ``duration`` seconds, (..., 2); tones below 1e-4 px do not count.
+        """Periods of the fastest tone in ``duration`` seconds, (..., 2).
 
-        Roll and zoom count from 1e-7 on, which is 1e-4 px at 1000 px from the centre.
+        Tones below 1e-4 px do not count, roll and zoom below 1e-7: 1e-4 px at 1000 px from the centre.
         """
         smallest = self.amplitude.new_tensor([1e-4, 1e-4, 1e-7, 1e-7][: self.amplitude.shape[-2]])
         visible = self.amplitude > smallest[:, None]
@@ -362,8 +361,7 @@ class Vibration(
     def timed_from(self, origin: float | Tensor) -> Self:
         """The same motion with another time origin, less the constant that the image motion adds to it.
 
-        Args:
-            origin: The time origin in s from the present one: a number, or a tensor with one for each of a batch.
+        The origin is in s from the present one: a number, or a tensor with one for each of a batch.
         """
         times = self.phase.new_tensor(origin) if isinstance(origin, float) else origin
         phase = self.phase + 2 * math.pi * times[..., None, None] * self.frequency
@@ -374,10 +372,7 @@ class Vibration(
         )
 
     def with_axes(self, order: Sequence[int], signs: Sequence[float]) -> Self:
-        """The vibration whose component k is ``signs[k]`` times component ``order[k]`` of this one.
-
-        A negative sign changes the phase by pi and returns it in [-pi, pi); amplitudes stay positive.
-        """
+        """The vibration whose component k is ``signs[k]`` times component ``order[k]``; amplitudes stay positive."""
         self._check_axes(order, signs)
         sign = torch.tensor(signs, dtype=torch.float64, device=self.device)
         axes = list(order)
@@ -500,14 +495,11 @@ def image_motion_line(vibration: Vibration, std: VibrationStd | None = None) -> 
 
 @checks_arguments
 def blind_frequencies(timing: SensorTiming, highest: float) -> Tensor:
-    """Frequencies up to ``highest`` Hz that cannot be measured from the frames.
+    """Frequencies up to ``highest`` Hz that cannot be measured from the frames, sorted, float64.
 
     ``j / (m T_row)``: every frame is displaced alike (the gain of Eq. 7 is zero). ``j / T_e``: the exposure averages
     the tone out (the sinc of Eq. 2 is zero). With individual frame start times, only frequencies for which all frames
     are displaced alike are blind; for two frames, ``j`` over the time between them.
-
-    Returns:
-        Sorted float64 tensor.
 
     Example:
         >>> timing = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)

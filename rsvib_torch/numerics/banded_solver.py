@@ -236,8 +236,8 @@ class _Solve(torch.autograd.Function):
 def solve_halves(system: Tensor | BandedFactor, right_side: Tensor) -> Tensor:
     """Solve Hermitian positive definite systems differentiably, for right sides and solutions (K, M, S).
 
-    The systems (H + b, 2 b + 1, 2 S), as from ``from_both_ends``, are overwritten unless their gradient is required; or
-    their factors, for solving several times, through which no gradient flows.
+    The systems (H + b, 2 b + 1, 2 S), as from ``from_both_ends``, are overwritten unless their gradient is required. No
+    gradient flows through factors, for solving several times.
     """
     return _Solve.apply(system, right_side)  # type: ignore[no-untyped-call]
 
@@ -247,10 +247,6 @@ def node_frequencies(count: int, step: float, device: torch.device) -> Tensor:
 
     Steps increase with the frequency up to ``step``, because priors change most at low frequencies: with steps of a
     sixth of the frequency, a restored frame of 2048 x 2048 px changes by 2e-5 of full scale (rms).
-
-    Example:
-        >>> node_frequencies(28, 3.0, torch.device("cpu")).tolist()
-        [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 14, 16, 18, 21, 24, 27]
     """
     nodes = [0]
     while nodes[-1] < count - 1:

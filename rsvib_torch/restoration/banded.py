@@ -86,10 +86,9 @@ def restore_banded(frames: Tensor, motion: FrameMotion, options: BandedOptions) 
 
     Scene row k appears at frame row r(k). The slab of rows r(k) - l ... r(k) + l, l = ``half_rows``, is assumed to have
     the PSF of that row. It is deconvolved by the Wiener filter ``H* / (|H|^2 + w (4 sin^2 pi u + 4 sin^2 pi v))``, w =
-    ``noise_to_signal``, and its central rows are kept. Whole pixels of the displacement shift the slab, so that a low
-    slab suffices. The prior penalises image gradients, which preserves the mean. Rows are extended smoothly at their
-    ends and mirrored above and below. All pixels count: ``restore`` replaces those without data by local means, and
-    saturated ones count at their level.
+    ``noise_to_signal``, and its central rows are kept. The prior penalises image gradients, which preserves the mean.
+    Whole pixels of the displacement shift the slab. Rows are extended smoothly at their ends and mirrored above and
+    below. All pixels count: ``restore`` replaces those without data by local means.
     """
     half_rows = check_whole_number("half_rows", options.half_rows, at_least=1, at_most=max(16, frames.shape[-2]))
     stride = check_whole_number("stride", options.stride, at_least=1, at_most=max(2, frames.shape[-2]))

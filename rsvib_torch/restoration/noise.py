@@ -340,10 +340,10 @@ ESTIMATORS: dict[str, Estimator] = {
 def noise_levels(frames: Tensor, motion: FrameMotion, ignore: Tensor | None = None) -> Tensor:
     """Standard deviation (B, T) of the noise of each frame of B stacks, in its unit; 0 without any content.
 
-    ``estimate_noise`` counts fine texture as noise, which makes it an upper bound. The first estimator of
-    ``ESTIMATORS`` that applies to a stack lowers it. A frame without content, or with too few measured pixels, is
-    assigned the median noise power of the others of its stack. The frames (B, T, C, H, W) are in row order, with local
-    means at pixels to ``ignore``.
+    ``estimate_noise`` counts fine texture as noise, which makes it an upper bound; the first estimator of
+    ``ESTIMATORS`` that applies to a stack lowers it. A frame without content, or with too few measured pixels, has the
+    median noise power of the others. The frames (B, T, C, H, W) are in row order, with local means at pixels to
+    ``ignore``.
     """
     alone = valid_mean(np.square(noise_deviation(frames, ignore)), -1)
     alone[_constant(frames)] = math.nan

@@ -188,10 +188,7 @@ def restore(
 @outside_graphs
 @full_precision
 def restore_prepared(frames: PreparedFrames, vibration: Motion, options: RestorationOptions) -> Tensor:
-    """``restore`` of prepared frames, without a check of motion and result, and without sharpening by ``optics``.
-
-    The motion is in image axes, the result (B, T, C, H, W) in row order.
-    """
+    """``restore`` of prepared frames by a motion in image axes, (B, T, C, H, W) in row order; no check, no ``optics``."""
     return _restored(frames, motion_of_frames(frames, vibration), options)
 
 
@@ -215,9 +212,8 @@ def restore_each(
 ) -> tuple[Tensor, Vibration, tuple[Reason, ...]]:
     """Restore each frame with its own vibration.
 
-    Returns:
-        Frames (B, T, C, H, W) in row order, as taken where no motion is known; the B T vibrations that were undone,
-        each with the time origin in the middle of its frame; a reason for each axis that was restored in no frame.
+    The results are frames (B, T, C, H, W) in row order, as taken where no motion is known; the B T vibrations that were
+    undone, each with the time origin in the middle of its frame; a reason for each axis that was restored in no frame.
     """
     (stacks, count), height = frames.images.shape[:2], frames.images.shape[-2]
     if tuple(followed.batch_shape) != ((stacks, count) if frames.batched else (count,)):

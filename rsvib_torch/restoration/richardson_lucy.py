@@ -22,10 +22,10 @@ def restore_richardson_lucy(
     """Restore frames by Richardson-Lucy iterations on the row-varying blur; negative values count as 0.
 
     ``c <- c K^T(m g / K c) / K^T m`` increases the likelihood of the scene for Poisson counts g of the measured pixels
-    m (Richardson 1972; Lucy 1974). The unknowns c are cubic B-spline coefficients of the scene: B-splines are positive,
-    hence the scene is non-negative, and they do not add the blur of linear interpolation. Every step preserves the
-    total intensity. The initial scene is the result of ``restore_dewarp``; fewer iterations amplify less noise. For
-    several frames of one scene, ``sum K^T(m g / K c) / sum K^T m`` is used, and their mean is the initial scene.
+    m (Richardson 1972; Lucy 1974), and preserves the total intensity. The unknowns c are cubic B-spline coefficients:
+    B-splines are positive, hence the scene is non-negative, and they do not add the blur of linear interpolation. The
+    initial scene is the result of ``restore_dewarp``; fewer iterations amplify less noise. For several frames of one
+    scene, ``sum K^T(m g / K c) / sum K^T m`` is used, and their mean is the initial scene.
     """
     iterations = options.iterations
     B, T, _, _, W = frames.shape

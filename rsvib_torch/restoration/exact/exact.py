@@ -53,17 +53,15 @@ def restore_exact(
 ) -> Tensor:
     """Restore frames with all rows coupled: the most probable scene for its frames and a prior.
 
-    The kernel changes from row to row but not along a row. So the Fourier transform is taken along rows only, and for
-    each horizontal frequency the frame g is a banded matrix K times the coefficients c of the scene across rows, from
-    which a kernel of six rows interpolates. Least squares with an autoregressive prior across rows, fitted to the
-    frames, is one banded Hermitian positive definite system ``(sum_m w_m K_m^H K_m + P) c = sum_m w_m K_m^H g_m`` per
-    frequency. The interpolation error of the kernel counts as noise. Several frames of one scene add their normal
-    matrices.
+    The kernel changes from row to row but not along a row. After a Fourier transform along the rows, the frame g is for
+    each horizontal frequency a banded matrix K times the coefficients c of the scene across rows, from which a kernel
+    of six rows interpolates. Least squares with an autoregressive prior across rows, fitted to the frames, is one
+    banded Hermitian positive definite system ``(sum_m w_m K_m^H K_m + P) c = sum_m w_m K_m^H g_m`` per frequency. The
+    interpolation error of the kernel counts as noise.
 
     Arguments and result as above ``METHODS``. Values of missing pixels are estimated from all others; those of
     saturated pixels are lower bounds, which are held approximately. ``strips`` neighbouring stacks of the batch are
-    strips of columns of the same frames: they have one noise level, and one strength of the prior for each level. With
-    ``scale=2``, point (2 i, 2 j) of the result is at pixel (i, j).
+    strips of columns of the same frames: they have one noise level, and one strength of the prior for each level.
     """
     # 1. Check the options, and list the frames of each result.
     factor, scale, prior = options.regularisation, options.scale, options.prior
@@ -217,8 +215,8 @@ class FrameModel:
         """What is missing in the data of each scene: ``"pixels"``, only the ``"extension"``, or ``"nothing"``.
 
         The boundary extension of blurred rows is missing, but not that of inner strips of columns, which end where they
-        have no weight (half the time, 0.00 dB). On the finer grid, extensions of different frames contradict each other
-        beyond half a cycle per px: filled, 49.9 dB become 53.9 dB (8 frames of 256 px, noise 0.002).
+        have no weight. On the finer grid, extensions of different frames contradict each other beyond half a cycle per
+        px: filled, 49.9 dB become 53.9 dB (8 frames of 256 px, noise 0.002).
         """
         outer = np.isin(scenes.stack % self.strips, (0, self.strips - 1))
         ends = (outer & (self._blur_reaches(scenes) > FILLED_BLUR_REACH)) | (self.scale > 1)

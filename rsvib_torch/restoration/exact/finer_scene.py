@@ -99,10 +99,9 @@ def finer_scene(problem: SceneProblem, width: int, neglected: float) -> tuple[Te
     cycles per px keep all of their contrast instead of a tenth.
 
     If this does not explain the residual, the frames differ from their model, in general by a wrong motion. The
-    differences then count as noise: detail is restored only as far as they allow. With an error of the phases of 0.05
-    rad, 27.5 dB become 32.6 dB (chart, noise 0.002, 2 frames; 32.8 dB on pixels), 34.4 become 38.1 dB with 8 frames
-    (34.7 dB on pixels). Displacements that the problem neglects, of standard deviation ``neglected`` px, count as noise
-    as well, but do not contradict the motion.
+    differences then count as noise: with an error of the phases of 0.05 rad, 27.5 dB become 32.6 dB (chart, noise
+    0.002, 2 frames; 32.8 dB on pixels), 34.4 become 38.1 dB with 8 frames (34.7 dB on pixels). Displacements that the
+    problem neglects, of standard deviation ``neglected`` px, count as noise as well, but do not contradict the motion.
     """
     factor, relaxed, largest = 1.0, torch.ones_like(problem.precision[0, 0]), math.inf
     allowed, noticed = _MAX_EFFECT, False

@@ -133,14 +133,14 @@ def restore_mosaic(
 ) -> Tensor:
     """Colour images (B, groups, 3, scale H, scale W) from mosaics: all frames of a group and all colours together.
 
-    The scene is unknown on a grid of half pixels, as in ``restore_exact`` with ``scale=2``, and each pixel measures one
-    of its colours. Luminance and two colour differences have independent priors, fitted to frames whose missing colours
-    are first interpolated and then predicted from the restored scene. ``similar_patches`` removes noise from it. Where
-    the frames do not determine the colours, as with one frame, ``similar_patches`` interpolates those of each.
+    The scene is unknown on a grid of half pixels, and each pixel measures one of its colours. Luminance and two colour
+    differences have independent priors, fitted to frames whose missing colours are first interpolated and then
+    predicted from the restored scene. ``similar_patches`` removes noise from it, and interpolates the colours of each
+    frame where the frames do not determine them, as with one frame.
 
-    Arguments as above ``METHODS``; ``colours`` (B, T, 1, H, W) is the colour that each pixel measures, 0 to 2, and the
-    prior declares ``mosaic`` in ``PRIORS``. ``noise="auto"`` is estimated from the residual of the frames of a group.
-    With one frame it is hardly known, and too low rather than too high.
+    Arguments as above ``METHODS``; ``colours`` (B, T, 1, H, W) is the colour that each pixel measures, 0 to 2.
+    ``noise="auto"`` is estimated from the residual of the frames of a group; that of one frame is too low rather than
+    too high.
     """
     # 1. Check the options, and list the frames of each result.
     height, width = frames.shape[-2:]

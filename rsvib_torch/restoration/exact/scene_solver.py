@@ -37,10 +37,6 @@ def row_windows(rows: int, count: int, overlap: int = 96) -> list[slice]:
 
     The dependence of a solution on distant rows decreases exponentially: windows are solved side by side, and the rows
     of the overlap are discarded. With 96 rows the solution changes by about 1e-5 unless the exposure blurs.
-
-    Example:
-        >>> row_windows(10, 2, overlap=1)
-        [slice(0, 6, None), slice(4, 10, None)]
     """
     size = -(-(rows + 2 * overlap * (count - 1)) // count)
     if count <= 1 or size >= rows:
@@ -78,8 +74,7 @@ class Partition:
 
         A single scene takes 32 MB, or 4 times the memory of its spectrum, for each of two chunks at a time on a CPU, so
         that results do not depend on the number of threads. Where exposures blur, the rows are not divided, and a step
-        of the elimination has fewer values: twice the memory saves 18 % of the time for frames of 1024 and 2048 rows,
-        four times the memory 30 %.
+        of the elimination has fewer values: twice the memory saves 18 % of the time for 1024 and 2048 rows.
         """
         if device.type == "cpu":
             values = max(1 << 22, 4 * rows * frequencies) if single else 1 << 24
@@ -124,11 +119,10 @@ class Partition:
 
 
 class SceneSolver:
-    """Solver of the normal equations of N scenes.
+    """Solver of the normal equations of N scenes; ``keep`` keeps the factors, for solving several times.
 
     The ``precision`` P are products (p + 1, p + 1, N, U) as from ``RowPrior.precision``, in units of the noise of
-    weight 1. ``keep`` keeps the factors, for solving several times. ``parts`` are the frequencies that are solved at a
-    time.
+    weight 1. ``parts`` are the frequencies that are solved at a time.
     """
 
     def __init__(

@@ -66,8 +66,7 @@ class SampledRows:
 def sample_rows(images: Tensor, kernels: RowKernels, chosen: NDArray[np.int64]) -> SampledRows:
     """Spectra of tapered rows of images (S, M, C, R, W) at frequencies (F,), cycles in W px, in slabs of equal height.
 
-    ``kernels`` are those of the rows of S M images, of a scene one after the other. Rows beyond the last slab are not
-    used.
+    ``kernels`` are those of the rows of S M images. Rows beyond the last slab are not used.
     """
     scenes, members, channels = images.shape[:3]
     slabs = max(1, images.shape[-2] // _SLAB_ROWS)
@@ -110,9 +109,9 @@ def prior_strengths(
     The prior is fitted to the power spectrum of the frames minus that of the noise. A weaker one predicts pixels better
     where dense texture is taken for noise, or where the scene differs from its mean spectrum.
 
-    The images (S, M, C, R, W) are in row order; ``noise_power`` (S, 1) is that of images of weight 1, ``blur_reach``
-    (S, 1) as in ``RowPrior.precision``. The noise level is ``certain`` if it is given or estimated from several frames:
-    that of a single frame includes texture, so that the prior cannot be too weak.
+    The images (S, M, C, R, W) are in row order; ``noise_power`` (S, 1) is that of images of weight 1. The noise level
+    is ``certain`` if it is given or estimated from several frames: that of a single frame includes texture, so that the
+    prior cannot be too weak.
     """
     height, width = images.shape[-2:]
     if min(height, width) < 64:  # too few values for a choice

@@ -87,7 +87,7 @@ def scene_weights() -> tuple[float, ...]:
     """Weights of the coefficients of rows -5 ... 5 in a row of the scene.
 
     On the rows, a wave of coefficients interpolated by the kernel has the amplitude of ``kernel_spectrum`` plus that of
-    its aliases. Exposures, and frames that sample at many places, do not contain the aliases. So the scene is the
+    its aliases, which exposures, and frames that sample at many places, do not contain. So the scene is the
     interpolation without aliases: the least-squares fit of these weights to ``kernel_spectrum`` up to 0.46 cycles per
     row, for amplitude spectra like frequency^-1 behind Gaussian optics of sigma 0.6 px.
     """
@@ -99,7 +99,7 @@ def scene_weights() -> tuple[float, ...]:
 
 
 def cosine_series(angles: Array, values: Array, reach: int, counts: Array | float = 1.0) -> Array:
-    """Weights 0 ... ``reach`` of the symmetric filter whose transfer function at ``angles`` (rad) is nearest to values.
+    """Weights 0 ... ``reach`` of the symmetric filter whose transfer at ``angles`` (rad) is nearest to values.
 
     Squared differences times the squares of ``counts`` are least.
     """
@@ -307,12 +307,9 @@ class Observation:
     """The observation operator K of N scenes, each observed by M frames of R rows of period L, and its normal matrices.
 
     ``A`` and ``A_adjoint`` have images of whole frames; ``forward`` and ``adjoint`` have spectra of some frequencies.
-
-    Attributes:
-        kernels: Kernels of the rows of N M frames, those of a scene one after the other.
-        u: (U,) frequencies along the rows in cycles per px, on the CPU.
-        top: First scene row that is observed or needed to evaluate a scene, in frame coordinates.
-        count: Number of such scene rows, K.
+    The ``kernels`` are those of the rows of N M frames, of a scene one after the other; ``u`` (U,) are the frequencies
+    along the rows in cycles per px, on the CPU. ``count`` scene rows K, from ``top`` on in frame coordinates, are
+    observed or needed to evaluate a scene.
     """
 
     kernels_of_rows = RowKernels.of_rows  # makes the kernels

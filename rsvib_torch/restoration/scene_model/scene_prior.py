@@ -95,9 +95,9 @@ def autoregressive_prior(observed: Tensor, transfer: Tensor, aliases: Tensor, no
 
     Each step computes the expected power spectrum of the scene for the current model, the sum of the squared Wiener
     estimate and of its variance, and fits the autoregressive model to it (Yule-Walker equations). ``observed`` (N, U,
-    V) is the power of the frames, horizontal frequencies by vertical ones, ``transfer`` that of the blur, and
-    ``noise_power`` that of the noise. ``aliases`` (N, T, U, V) is the power of the interpolation error of the kernel
-    between rows, through the blur of each frame, for a wave of power 1.
+    V) is the power of the frames, ``transfer`` that of the blur, and ``noise_power`` that of the noise. ``aliases`` (N,
+    T, U, V) is the power of the interpolation error of the kernel between rows, through the blur of each frame, for a
+    wave of power 1.
     """
     _, U, V = observed.shape
     constants = (

@@ -367,7 +367,7 @@ def _judge_batch(
     """Verdicts on all stacks of a batch, whose displacement depends on the row only.
 
     The ``pairs`` are counted among the frames that are compared, which have ``numbers`` in the stack. One image is
-    restored from ``shared`` frames. The timing is in image orientation; ``columns`` as in ``judge_stacks``.
+    restored from ``shared`` frames. The timing is in image orientation.
     """
     # What the frames of each pair have in common. Stacks with too little are not judged; stacks whose parts of one size
     # would be too small are judged one by one.

@@ -234,9 +234,9 @@ def misfit(first: Tensor, second: Tensor) -> tuple[Array, Array]:
 def reblur(scenes: Tensor, motion: FrameMotion, frame: int, first_rows: list[int]) -> Tensor:
     """Form one frame of each stack from restored scenes (Eq. 9), independently of the restoration method.
 
-    Displacement along rows is a phase ramp, across rows a B-spline, the exposure a Gauss-Legendre sum. The scenes (B,
-    C, H, W) are in row order, in the coordinates in which frame ``frame`` is restored; they may be a part of the rows
-    and columns, and are mirrored beyond. Row 0 of a scene is at its row of ``first_rows`` of the frame.
+    The scenes (B, C, H, W) are in row order, in the coordinates in which frame ``frame`` is restored; they may be a
+    part of the rows and columns, and are mirrored beyond. Row 0 of a scene is at its row of ``first_rows`` of the
+    frame.
     """
     # displacement of each row during its exposure
     degree, count, (height, width) = 5, len(scenes), scenes.shape[-2:]
