@@ -188,7 +188,7 @@ def restore(
 @outside_graphs
 @full_precision
 def restore_prepared(frames: PreparedFrames, vibration: Motion, options: RestorationOptions) -> Tensor:
-    """``restore`` of prepared frames by a motion in image axes, (B, T, C, H, W) in row order; no check, no ``optics``."""
+    """``restore`` of prepared frames by a motion in image axes, (B, T, C, H, W) in row order, without any checks."""
     return _restored(frames, motion_of_frames(frames, vibration), options)
 
 

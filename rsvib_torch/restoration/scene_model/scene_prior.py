@@ -6,7 +6,6 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +16,7 @@ from torch.nn import functional
 from rsvib_torch.execution.chunking import at_once, runs
 from rsvib_torch.numerics.fourier import extend_rows, squared_modulus, waves
 from rsvib_torch.numerics.splines import mirrored
-from rsvib_torch.numerics.tables import Array, constant, tables
+from rsvib_torch.numerics.tables import Array, constant
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.scene_model.observation import kernel_spectrum
 
@@ -79,9 +78,6 @@ class RowPrior:
         return self.products() * ratio.maximum(lowest).clamp(max=1e3)
 
 
-Table = Any  # a tensor, or an array of NumPy: operators that both have
-
-
 def _mixing(count: int, weights: Sequence[float], fold: Callable[[Array], Array]) -> Array:
     """Matrix (U, U) of a weighted mean over neighbouring frequencies, whose indices are folded at both ends."""
     matrix = np.zeros((count, count))
@@ -100,7 +96,7 @@ def autoregressive_prior(observed: Tensor, transfer: Tensor, aliases: Tensor, no
     wave of power 1.
     """
     _, U, V = observed.shape
-    constants = (
+    matrices = (
         # cosines of the lags of autocovariances (V, p + 1), and the pooling of the lags over neighbouring frequencies
         np.cos(2 * np.pi * np.fft.fftfreq(V)[:, None] * np.arange(ORDER + 1)),
         _mixing(U, (0.25, 0.5, 0.25), lambda u: np.minimum(np.abs(u), 2 * (U - 1) - np.abs(u))) / V,
@@ -108,23 +104,7 @@ def autoregressive_prior(observed: Tensor, transfer: Tensor, aliases: Tensor, no
         _mixing(U, (0.2,) * 5, lambda u: u.clip(0, U - 1)),
         _mixing(V, (0.2,) * 5, lambda v: v % V),
     )
-    spectra, device = (observed, transfer, aliases, noise_power), observed.device
-    if torch.is_grad_enabled() and any(values.requires_grad for values in spectra):
-        of_tensors = [torch.as_tensor(constant, device=device) for constant in constants]
-        power, reflections, interpolation = _expectation_maximisation(spectra, of_tensors)
-        return RowPrior(power, torch.stack(reflections), interpolation)
-    # small tables, for which the calls of PyTorch would take longer than the arithmetic
-    power, reflections, interpolation = _expectation_maximisation(tables(*spectra), constants)
-    return RowPrior(*(torch.from_numpy(values).to(device) for values in (power, np.stack(reflections), interpolation)))
-
-
-def _expectation_maximisation(spectra: Sequence[Table], constants: Sequence[Table]) -> tuple[Table, list[Table], Table]:
-    """Power (N, U), partial correlations, and interpolation power (N, T, U) of the scene; tensors or arrays.
-
-    The spectra are the arguments of ``autoregressive_prior``, which makes the constants.
-    """
-    observed, transfer, aliases, noise_power = spectra
-    cosine, pooling, around_u, around_v = constants
+    cosine, pooling, around_u, around_v = (torch.from_numpy(matrix).to(observed.device) for matrix in matrices)
     # steps are small where the noise is stronger than the scene: below half of the noise power, the initial value is
     # pooled over neighbouring frequencies, as that of a single one depends on chance
     excess, level = observed - noise_power, 0.5 * noise_power
@@ -148,7 +128,7 @@ def _expectation_maximisation(spectra: Sequence[Table], constants: Sequence[Tabl
         gain = 1.0 / (penalty + transfer)
         scene = gain * noise_power + gain * gain * through
     interpolation = (scene[:, None] * aliases).mean(-1)
-    return power, [first, second], interpolation.clip(_TINY, None)
+    return RowPrior(power, torch.stack([first, second]), interpolation.clip(_TINY, None))
 
 
 def brightness(frames: Tensor) -> Tensor:
