@@ -31,10 +31,9 @@ from rsvib_torch.frames.orientation import (
     reasons_from_row_order,
     sequence_from_row_order,
 )
-from rsvib_torch.gyroscope.clock_range import offset_range, outside
 from rsvib_torch.gyroscope.corner_tracks import corner_tracks
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
-from rsvib_torch.gyroscope.rotation_alignment import RotationAlignment, align_rates
+from rsvib_torch.gyroscope.rotation_alignment import RotationAlignment, align_rates, offset_range, outside
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.spline import FreeMotion

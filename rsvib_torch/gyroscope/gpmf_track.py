@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from rsvib_torch.checks.values import needed_package
-from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, orientation_matrix
-from rsvib_torch.gyroscope.text_logs import angular_rates, check_orientation
+from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, angular_rates
 from rsvib_torch.numerics.tables import Array
 
 _MAX_PACKETS = 10**5  # 28 hours; cameras write one per second
@@ -49,8 +48,7 @@ def read_gpmf(path: Path) -> AngularRates:
     source = f"{path.name}, GPMF track, {len(parts)} packets" + (f", axes {orientation}" if orientation else "")
     if any(part.stabilised for part in parts):
         source += ", images that the camera has stabilised (IORI)"
-    rates = rates @ orientation_matrix(orientation).numpy().T if orientation else rates
-    return angular_rates(path, _sample_times(parts), rates, source)
+    return angular_rates(path, _sample_times(parts), rates, source, orientation or "XYZ")
 
 
 @dataclass(frozen=True)
@@ -236,8 +234,6 @@ def _part(stream: bytes, packet: _Packet, earliest: float | None) -> _Part | Non
         raise IndexError("GYRO with a wrong SCAL")
     letters = next((content for name, *_, content in _entries(stream) if name == b"ORIN"), b"")
     orientation = letters.decode("latin-1").strip("\0 ")
-    if orientation:
-        check_orientation(orientation)
     samples = None if total is None else int(total[0, 0])
     return _Part(rates / scale, packet.start, packet.duration, _stamp(stream), earliest, samples, orientation)
 
