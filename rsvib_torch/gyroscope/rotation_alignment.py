@@ -11,12 +11,15 @@ from rsvib_torch.checks.values import check_number
 from rsvib_torch.detection.verdict import recording_reasons
 from rsvib_torch.gyroscope.corner_tracks import CornerTracks
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, orientation_matrix
-from rsvib_torch.gyroscope.rotation_fit import NAMES, RotationFit, RotationModel, components_of, fit_robustly
-from rsvib_torch.gyroscope.rotation_search import (
-    OrientationSearch,
-    Start,
-    search_orientations,
+from rsvib_torch.gyroscope.rotation_fit import (
+    NAMES,
+    RotationFit,
+    RotationModel,
+    components_of,
+    fit_robustly,
+    image_components,
 )
+from rsvib_torch.gyroscope.rotation_search import OrientationSearch, Start, search_orientations
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
@@ -323,9 +326,8 @@ def _motion(fit: RotationFit, clock: Tensor, margin: int = 4) -> FreeMotion:
     low = max(int(torch.searchsorted(times, clock[0])) - margin, 0)
     high = min(int(torch.searchsorted(times, clock[1])) + margin, len(times))
     part = AngularRates(times[low:high], model.rates.rates[low:high].cpu() - parameters[:3])
-    pitch, yaw, roll = (part.attitude(float(parameters[3])) @ orientation_matrix(model.orientation).T).unbind(-1)
-    focal_length = float(parameters[5])
-    moved = torch.stack([-focal_length * yaw, focal_length * pitch, -roll], -1)
+    turned = part.attitude(float(parameters[3])) @ orientation_matrix(model.orientation).T
+    moved = image_components(turned, parameters[5])
     recorded_times = (part.times - parameters[3]) / parameters[4] + model.middle
-    camera = replace(model.camera, focal_length=focal_length)
+    camera = replace(model.camera, focal_length=float(parameters[5]))
     return FreeMotion.from_samples(recorded_times, moved, spacing=float(recorded_times.diff().median()), camera=camera)

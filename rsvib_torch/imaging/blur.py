@@ -52,10 +52,8 @@ class RowPSF:
 
     def centroid(self) -> Tensor:
         """Mean displacement of each row in px, (..., R, 2), axes (x, y): the first moment of its kernel."""
-        rows = torch.arange(self.weights.shape[-2], dtype=self.weights.dtype, device=self.weights.device)
-        columns = torch.arange(self.weights.shape[-1], dtype=self.weights.dtype, device=self.weights.device)
-        x = (self.weights.sum(-2) * columns).sum(-1)
-        y = (self.weights.sum(-1) * rows).sum(-1)
+        rows, columns = (torch.arange(count).to(self.weights) for count in self.weights.shape[-2:])
+        x, y = (self.weights.sum(-2) * columns).sum(-1), (self.weights.sum(-1) * rows).sum(-1)
         return torch.stack([x, y], dim=-1) + self.first_tap
 
     def dense(self) -> tuple[Tensor, tuple[int, int]]:

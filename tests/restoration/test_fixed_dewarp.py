@@ -75,8 +75,7 @@ def test_gradient_reaches_the_frames():
 def test_arguments_that_restore_refuses_are_refused(change, message):
     timing, _ = recording()
     arguments = {"timing": timing, "vibration": VIBRATION, "size": (72, 90), "num_frames": 2} | change
-    with pytest.raises(ValueError, match=message):
-        rsv.FixedDewarp(**arguments)
+    refuses(lambda: rsv.FixedDewarp(**arguments), message)
 
 
 def test_frames_of_another_size_are_refused():
