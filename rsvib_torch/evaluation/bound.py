@@ -316,12 +316,11 @@ def cramer_rao_bound(
 ) -> VibrationStd:
     """Cramér-Rao bound of the parameters of a vibration, for white Gaussian noise and an unknown scene.
 
-    No unbiased estimate has a smaller standard deviation. With D the derivatives of the frames by the parameters and
-    A the operator that forms the frames, ``J = D' (1 - A (A' A)^-1 A') D / noise^2`` is the information if the scene is
-    unknown too, and the bound is the root of the diagonal of its inverse.
-    All parameters are unknown together: amplitude, frequency and phase (at the time origin) of all tones, and the
-    image motion, of all axes of the motion: x and y, with three or four axes also roll and zoom, tones of amplitude 0
-    included in the image motion only. ``docs/bound.md`` has the derivation.
+    No unbiased estimate has a smaller standard deviation. With D the derivatives of the frames by the parameters and A
+    the operator that forms the frames, ``J = D' (1 - A (A' A)^-1 A') D / noise^2`` is the information if the scene is
+    unknown too, and the bound is the root of the diagonal of its inverse. All parameters are unknown together:
+    amplitude, frequency and phase (at the time origin) of all tones of an amplitude above 0, and the image motion, of
+    all axes of the motion. ``docs/bound.md`` has the derivation.
 
     Args:
         scene: (H, W) noise-free still scene, floating point, full scale 1, larger than the frames.
@@ -332,8 +331,7 @@ def cramer_rao_bound(
         frame_size: (height, width) of the frames, as in ``simulate_frames``.
         method: ``"projection"``, exact for an unknown deterministic scene; ``"gradients"``, its closed approximation
             row by row, several times faster; or ``"random"``, the same for a random Gaussian scene with the power
-            spectrum of this one: larger if part of the spectrum is below the noise, since the scene is estimated
-            from the same frames.
+            spectrum of this one: larger if part of the spectrum is below the noise.
         acceleration: Whether the image acceleration is unknown as well (else it is known).
 
     Returns:

@@ -66,17 +66,6 @@ class ClockAlignment(
         unexplained: (2,) px, rms displacement of rows that the aligned motion does not explain, beyond their noise.
         reliable: Whether the recording explains the measurements, at this offset only.
         findings: Each ``Reason`` why not; ``reasons`` has their texts.
-
-    Example:
-        >>> import torch
-        >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.datasets import example_frames
-        >>> frames, timing, vibration = example_frames()
-        >>> times = torch.linspace(0.0, 0.05, 101, dtype=torch.float64)
-        >>> recorded = rsv.FreeMotion.from_samples(times, vibration.displacement(times))
-        >>> found = rsv.align_motion(frames, timing, recorded, offsets=(-0.004, 0.004))
-        >>> abs(found.offset) < 1e-4  # s: the clocks agree
-        True
     """
 
     motion: FreeMotion

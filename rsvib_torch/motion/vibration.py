@@ -402,14 +402,6 @@ class VibrationStd(
     ``displacement`` (..., 2) in px is that of the displacement of the rows of the record, rms over the rows and without
     their mean. It contains the image motion and the correlations of all parameters: a record shorter than a period
     leaves amplitude and frequency uncertain, and may still determine the displacement. None: not known.
-
-    Example:
-        >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.datasets import example_frames
-        >>> frames, timing, _ = example_frames()
-        >>> std = rsv.detect_vibration(frames, timing).std
-        >>> bool((std.frequency < 0.1).all())  # Hz
-        True
     """
 
     _MISSING = math.inf  # None in a file: an unknown standard deviation

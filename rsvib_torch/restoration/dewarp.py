@@ -101,8 +101,7 @@ class FixedDewarp(nn.Module):
         num_frames: Frames of a stack.
 
     Raises:
-        ValueError: If the vibration is a batch or has roll, zoom or a camera, or if frames of this size are refused by
-            ``restore``.
+        ValueError: If the vibration is a batch or has roll, zoom or a camera, or ``restore`` refuses this size.
 
     Example:
         >>> import rsvib_torch as rsv

@@ -196,13 +196,11 @@ def judge_restoration(
 ) -> RestorationVerdict:
     """Judge whether restored frames are better than raw ones, without the true scene.
 
-    Three quantities are measured. Every restored frame, blurred by the motion of the next one, should equal that next
-    frame: a wrong vibration leaves a displacement between the two (``misfit_after``). Restored frames should agree
-    with each other better than raw frames do, noise and ringing included (``predicted_gain``). The residual should be
-    noise (``chi_square``).
-
-    A vibration that displaces all frames alike (at a blind frequency) is not visible in these quantities; the outcome
-    is then ``"unknown"``.
+    Every restored frame, blurred by the motion of the next one, should equal that next frame: a wrong vibration leaves
+    a displacement between the two (``misfit_after``). Restored frames should agree with each other better than raw
+    frames do, noise and ringing included (``predicted_gain``). The residual should be noise (``chi_square``). A
+    vibration that displaces all frames alike (at a blind frequency) is not visible in these quantities; the outcome is
+    then ``"unknown"``.
 
     Args:
         frames: Raw stack (T, H, W) or (T, C, H, W), at least two frames.
@@ -231,8 +229,7 @@ def judge_restoration(
         >>> wrong = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[3.6, 4.1])  # opposite phase
         >>> for candidate in (vibration, wrong):
         ...     restored = rsv.restore(frames, timing, candidate, check=False)
-        ...     verdict = rsv.judge_restoration(frames, restored, timing, candidate)
-        ...     print(verdict.outcome)
+        ...     print(rsv.judge_restoration(frames, restored, timing, candidate).outcome)
         ('helps',)
         ('worse',)
     """
