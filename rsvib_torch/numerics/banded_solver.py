@@ -271,8 +271,8 @@ class InterpolatedFactors:
         tensors = factor_banded(halves, count).tensors
         return cls(nodes, tuple(values.unflatten(-1, (-1, len(nodes))).contiguous() for values in tensors))
 
-    def at(self, part: slice, out: BandedFactor | None = None) -> BandedFactor:
-        """Factors of n S matrices at S consecutive frequencies, in the memory of ``out`` if they fit."""
+    def at(self, part: slice) -> BandedFactor:
+        """Factors of n S matrices at S consecutive frequencies."""
         chosen = torch.arange(part.start, part.stop, dtype=torch.float64, device=self.nodes.device)
         ends = torch.searchsorted(self.nodes, chosen[[0, -1]].long(), right=True).clamp(max=len(self.nodes) - 1)
         near = slice(int(ends[0]) - 1, int(ends[1]) + 1)
@@ -280,11 +280,5 @@ class InterpolatedFactors:
         rising = (chosen - places[:-1, None]) / places.diff()[:, None]
         one = torch.ones_like(rising[:1])
         hat = torch.minimum(torch.cat([one, rising]), torch.cat([1 - rising, one])).clamp(min=0)  # (nodes, S)
-        shapes = [(*values.shape[:-2], values.shape[-2] * len(chosen)) for values in self.tensors]
-        if out is None or out.tensors[0].shape != shapes[0]:
-            memory = (values.new_empty(shape) for values, shape in zip(self.tensors, shapes, strict=True))
-            out = BandedFactor.of_tensors(*memory)
-        for values, target in zip(self.tensors, out.tensors, strict=True):
-            weights = hat.to(dtype=values.dtype, device=values.device)
-            torch.mm(values[..., near].flatten(0, -2), weights, out=target.view(-1, len(chosen)))
-        return out
+        tensors = ((values[..., near] @ hat.to(values)).flatten(-2) for values in self.tensors)
+        return BandedFactor.of_tensors(*tensors)

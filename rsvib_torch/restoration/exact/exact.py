@@ -324,7 +324,7 @@ def solve_scenes(
     differences: list[FrameDifference] = []
     advance = steps(len(scenes.stack), "frames")
 
-    def solve(block: tuple[str, list[int]], partition: Partition) -> None:
+    def solve(block: tuple[str, list[int]]) -> None:
         """Solve the scenes of a block."""
         kind, numbers = block
         some = take_stacks([scenes], np.array(numbers))
@@ -339,14 +339,13 @@ def solve_scenes(
 
     if torch.is_grad_enabled() and (frames.requires_grad or model.motion.exposures[0].requires_grad):
         for block in blocks:
-            solve(block, partition)
+            solve(block)
     else:
         threads = min(Partition.threads(frames.device), len(blocks))
 
         def share(thread: int) -> None:
-            memory = replace(partition)  # each thread has its own
             for block in blocks[thread::threads]:
-                solve(block, memory)
+                solve(block)
 
         in_parallel(share, range(threads), frames.device)
     return torch.stack([found[number] for number in range(len(scenes.stack))]), differences

@@ -12,10 +12,9 @@ frequencies and interpolates the factors for all others.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from math import prod
 
 import torch
 from torch import Tensor
@@ -54,14 +53,13 @@ def join_windows(values: Tensor, windows: list[slice]) -> Tensor:
     return torch.cat([values[a - w.start : b - w.start, ..., k, :] for k, (w, (a, b)) in enumerate(parts)])
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True)
 class Partition:
-    """Which parts of the systems of a scene are solved at a time, in memory that is used again."""
+    """Which parts of the systems of a scene are solved at a time."""
 
     chunk: int | None = None  # frequencies solved at a time; None: chosen by memory
     # number of windows of rows; None: as many as make a step of the elimination worth its call
     segments: int | None = None
-    _buffers: dict[int, Tensor] = field(default_factory=dict, init=False)
 
     @staticmethod
     def threads(device: torch.device) -> int:
@@ -110,13 +108,6 @@ class Partition:
         count = self.segments or max(1, rows // (512 if device.type == "cpu" else 256))
         return runs(frequencies, chunk), row_windows(rows, count)
 
-    def buffer(self, thread: int, shape: tuple[int, ...], like: Tensor) -> Tensor:
-        """Memory of a thread: page faults in fresh memory take as long as the elimination."""
-        if thread not in self._buffers or self._buffers[thread].numel() < prod(shape):
-            self._buffers.pop(thread, None)
-            self._buffers[thread] = like.new_empty(prod(shape))
-        return self._buffers[thread][: prod(shape)].view(shape)
-
 
 class SceneSolver:
     """Solver of the normal equations of N scenes; ``keep`` keeps the factors, for solving several times.
@@ -130,7 +121,7 @@ class SceneSolver:
     ) -> None:
         self.observation, self.precision, self.u = observation, precision, observation.u
         normal = observation.normal(len(precision) - 1)
-        self._partition = partition
+
         self.parts, self._windows = partition.divide(
             observation.count,
             normal.width,
@@ -185,38 +176,34 @@ class SceneSolver:
 
     def _solution(self, right_side: Callable[[slice], Tensor], given: Tensor) -> Tensor:
         """Solution (K, C, N, U) for right sides (K, C, N, S) of parts of the frequencies, computed from ``given``."""
-        interpolated: dict[int, BandedFactor] = {}  # of each thread, in memory that is used again
         differentiates = self._differentiates(given)
         factors = self._factors if self._keep and not differentiates else []
         scenes, windows = self.observation.num_scenes, self._windows
 
-        def solve(number: int, thread: int) -> Tensor:
+        def solve(number: int) -> Tensor:
             part = self.parts[number]
             # windows of the rows, (R, C, N W S)
             whole = right_side(part)
             right = torch.stack([whole[window] for window in windows], dim=3).flatten(2)
             system: Tensor | BandedFactor
             if self._interpolated is not None:
-                system = self._interpolated.at(part, None if differentiates else interpolated.get(thread))
-                interpolated[thread] = system
+                system = self._interpolated.at(part)
             elif factors:
                 system = factors[number]
             else:
-                shape = (*self._normal.left.shape[:4], part.stop - part.start)
-                out = None if differentiates else self._partition.buffer(thread, shape, given)
-                system = self._normal.at(self.u[part], self.precision[..., part], out)
+                system = self._normal.at(self.u[part], self.precision[..., part])
             solution = solve_halves(system, right)
             return join_windows(solution.unflatten(-1, (scenes, len(windows), -1)), windows)
 
         if differentiates:
-            return torch.cat([solve(number, 0) for number in range(len(self.parts))], dim=-1)
+            return torch.cat([solve(number) for number in range(len(self.parts))], dim=-1)
         channels = given.shape[-3 if given.ndim == 5 else 1]
         coefficients: Tensor = given.new_empty(self.observation.count, channels, scenes, len(self.u))
         threads = min(Partition.threads(given.device), len(self.parts))
 
         def share(thread: int) -> None:
             for number in range(thread, len(self.parts), threads):
-                coefficients[..., self.parts[number]] = solve(number, thread)
+                coefficients[..., self.parts[number]] = solve(number)
 
         in_parallel(share, range(threads), given.device)
         return coefficients

@@ -89,12 +89,12 @@ class FinerBand(SmoothBand):
     ``left`` contains the bands of ``T^m`` for both aliases behind the real and imaginary parts at the nodes.
     """
 
-    def at(self, u: Tensor, precision: Tensor, out: Tensor | None = None) -> Tensor:
+    def at(self, u: Tensor, precision: Tensor) -> Tensor:
         """Skewed bands as in ``SmoothBand.at``, for a precision (p + 1, 2, U) as of ``PolynomialPrior.precision``."""
         prior = torch.stack([precision, torch.zeros_like(precision)], dim=-1).flatten(-2).flatten(0, 1)
         interpolation = interpolation_matrix(self.reach, u, self.left.dtype, symmetric=False)[1]
         right = torch.cat([interpolation.to(prior), prior])
-        return torch.view_as_complex(self._product(right, out)).flatten(2)
+        return torch.view_as_complex(self._product(right)).flatten(2)
 
 
 def _laplacian_powers(count: int, order: int, device: torch.device) -> Tensor:

@@ -226,13 +226,12 @@ class SmoothBand:
         left = from_both_ends(torch.cat([parts, parts.new_zeros(self.width, *parts.shape[1:])]))
         return replace(self, left=left, windows=len(windows), rows=len(parts))
 
-    def at(self, u: Tensor, precision: Tensor, out: Tensor | None = None) -> Tensor:
+    def at(self, u: Tensor, precision: Tensor) -> Tensor:
         """Halves (H + b, 2 b + 1, 2 n U) of the matrices in windows, complex, at frequencies u (U,) in cycles per px.
 
-        The ``precision`` are products (p + 1, p + 1, N, U) of the prior there; ``out`` is memory for the halves: page
-        faults in fresh memory take as long as the product that fills it.
+        The ``precision`` are products (p + 1, p + 1, N, U) of the prior there.
         """
-        bands = self._product(interpolation_matrix(self.reach, u, self.left.dtype, symmetric=True)[1], out)
+        bands = self._product(interpolation_matrix(self.reach, u, self.left.dtype, symmetric=True)[1])
         order, half = len(precision) - 1, len(self.left) - self.width
         # what is added to the diagonals of the first p rows of the scene, of all rows, and of the first p middle rows
         selected = constant(prior_diagonals, order, dtype=precision.dtype, device=precision.device)
@@ -252,14 +251,9 @@ class SmoothBand:
         second[:order, ..., -1:, :].add_(ends)
         return torch.view_as_complex(bands).flatten(2)
 
-    def _product(self, right: Tensor, out: Tensor | None) -> Tensor:
+    def _product(self, right: Tensor) -> Tensor:
         """Products (H + b, 2 b + 1, 2, n, U, 2) with a matrix."""
-        rows, right = self.left.flatten(0, 3), right.to(self.left)
-        if out is None:
-            product = rows @ right
-        else:
-            product = torch.mm(rows, right, out=torch.view_as_real(out).view(len(rows), -1))
-        return product.view(*self.left.shape[:4], -1, 2)
+        return (self.left @ right.to(self.left)).unflatten(-1, (-1, 2))
 
 
 @cache
