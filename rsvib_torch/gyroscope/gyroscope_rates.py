@@ -21,11 +21,7 @@ from rsvib_torch.text import quoted, text_table
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class AngularRates(
-    Result,
-    units={"times": "s", "rates": "rad/s"},
-    shapes={"times": "N", "rates": "N 3"},
-):
+class AngularRates(Result, units={"times": "s", "rates": "rad/s"}, shapes={"times": "N", "rates": "N 3"}):
     """Angular rates of a gyroscope about its three axes, in rad/s.
 
     Attributes:

@@ -139,12 +139,10 @@ class SensorNoise:
         description="Standard deviation of the gain of the pixels (photo response non-uniformity), as a fraction.",
     )
     column_offset: Fraction = Field(
-        default=0.0,
-        description="Standard deviation of the offsets of the columns as a fraction of full scale.",
+        default=0.0, description="Standard deviation of the offsets of the columns as a fraction of full scale."
     )
     row_offset: Fraction = Field(
-        default=0.0,
-        description="Standard deviation of the offsets of the rows as a fraction of full scale.",
+        default=0.0, description="Standard deviation of the offsets of the rows as a fraction of full scale."
     )
     pattern_seed: int = Field(
         default=0, ge=0, le=2**63 - 1, description="Seed of the fixed pattern; each seed is another sensor."

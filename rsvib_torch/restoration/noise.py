@@ -330,10 +330,7 @@ def _fit_floor(power: Tensor, frequency: Tensor, sector: Tensor) -> Tensor:
 # It must not change its arguments, must not raise for small, constant or masked frames, and a stack must not affect
 # another one.
 Estimator = Callable[[Tensor, FrameMotion, Tensor | None, Tensor], Tensor]
-ESTIMATORS: dict[str, Estimator] = {
-    "frame pair": noise_of_frame_pair,
-    "spectral floor": noise_of_spectral_floor,
-}
+ESTIMATORS: dict[str, Estimator] = {"frame pair": noise_of_frame_pair, "spectral floor": noise_of_spectral_floor}
 
 
 @torch.no_grad()

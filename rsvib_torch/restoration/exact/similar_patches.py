@@ -91,9 +91,7 @@ def _similar(images: Tensor, starts: Tensor, places: Tensor, period: int) -> Ten
     ends = (max(0, begin - _REACH), min(height, end + _REACH))
     above, below = begin - ends[0], ends[1] - end
     wide = functional.pad(
-        images[..., ends[0] : ends[1], :],
-        (_REACH, _REACH, _REACH - above, _REACH - below),
-        value=torch.inf,
+        images[..., ends[0] : ends[1], :], (_REACH, _REACH, _REACH - above, _REACH - below), value=torch.inf
     )
     # 2. For each place in the pattern, the distances of the patches at all moves that lead to it, and the nearest ones.
     numbers = []
