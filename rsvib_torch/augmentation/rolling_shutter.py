@@ -133,10 +133,10 @@ class ImageMotion:
         return masks.flatten(-2).gather(-1, index).reshape(masks.shape)
 
     def move_boxes(self, boxes: Tensor) -> Tensor:
-        """Boxes (B, N, 4, 2) of corner pixels, in row order, that contain the moved content of the given boxes.
+        """Boxes (B, N, 4, 2) of corner pixels, in row order, around the moved content of the given boxes.
 
-        Rows move by different amounts, so the content of an upright box becomes curved: the result is the smallest
-        upright box around it. Boxes that are not upright are moved corner by corner.
+        The content of an upright box becomes curved, and its result is the smallest upright box around it. Boxes that
+        are not upright are moved corner by corner.
         """
         low, high = boxes.amin(-2), boxes.amax(-2)
         count = int((high - low)[..., 1].amax().ceil()) + 2
@@ -250,8 +250,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         """Record images (H, W), (C, H, W) or (B, C, H, W); the other arguments are those of Kornia's augmentations."""
         if not torch.compiler.is_compiling():
             check_tensor("input", input)
-        recorded: Tensor = super().forward(input, params, **kwargs)
-        return recorded
+        return super().forward(input, params, **kwargs)
 
     @checks_arguments
     def generate_parameters(self, batch_shape: tuple[int, ...]) -> Parameters:

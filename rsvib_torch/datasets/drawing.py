@@ -62,14 +62,12 @@ def sectors(x: Tensor, y: Tensor, count: int, sigma: float) -> Tensor:
 def smoothed(image: Tensor, sigma: float) -> Tensor:
     """Image blurred by a Gaussian, periodic at its borders (a product of Fourier transforms)."""
     transfer = torch.exp(-2 * (math.pi * sigma) ** 2 * _squared_frequencies(*image.shape[-2:]))
-    blurred: Tensor = torch.fft.irfft2(torch.fft.rfft2(image) * transfer, s=image.shape[-2:])
-    return blurred
+    return torch.fft.irfft2(torch.fft.rfft2(image) * transfer, s=image.shape[-2:])
 
 
 def _squared_frequencies(height: int, width: int) -> Tensor:
     """Squares of the frequencies of ``rfft2``, in cycles/px."""
-    squared: Tensor = torch.fft.fftfreq(height, **FLOAT)[:, None].square() + torch.fft.rfftfreq(width, **FLOAT).square()
-    return squared
+    return torch.fft.fftfreq(height, **FLOAT)[:, None].square() + torch.fft.rfftfreq(width, **FLOAT).square()
 
 
 def fractal_texture(

@@ -135,8 +135,7 @@ def _border_distance(x: Tensor, y: Tensor, first: Tensor, second: Tensor, distri
     place_x, place_y = districts.place.view(-1, 2).T.contiguous()
     to_x, to_y = place_x[second] - place_x[first], place_y[second] - place_y[first]
     middle_x, middle_y = 0.5 * (place_x[second] + place_x[first]), 0.5 * (place_y[second] + place_y[first])
-    distance: Tensor = ((middle_x - x) * to_x + (middle_y - y) * to_y) / torch.hypot(to_x, to_y)
-    return distance
+    return ((middle_x - x) * to_x + (middle_y - y) * to_y) / torch.hypot(to_x, to_y)
 
 
 def _borders(strip: tuple[int, int], width: int, districts: _Districts) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -209,7 +208,7 @@ def _plan_buildings(
     """Rows of buildings along the streets of every town and works district, and a few farms in the fields.
 
     The (N, 8) values are centre x and y, half of the two sides, direction of the first side in rad, tone of the roof,
-    length of the shadow, all lengths in px, and 1 where the two sides of the roof differ in tone, 0 where it is flat.
+    length of the shadow, all lengths in px, and 1 for a gabled roof, 0 for a flat one.
     """
     kinds = enumerate(districts.kind.view(-1).tolist())
     plans = [_plan_district(index, kind, districts, lines, generator) for index, kind in kinds if kind != _WOOD]
@@ -275,8 +274,7 @@ def _draw_buildings(image: Tensor, plan: Tensor, sigma: float) -> Tensor:
         columns = corner[:, 0, None, None] + steps + pad
         layers.view(3, -1).index_add_(1, (rows * layers.shape[-1] + columns).flatten(), windows.flatten(1))
     light, roofs, coverage = layers[:, pad : pad + height, pad : pad + width]
-    drawn: Tensor = image * light.exp() * (1.0 - coverage) + roofs
-    return drawn
+    return image * light.exp() * (1.0 - coverage) + roofs
 
 
 def _draw_windows(x: Tensor, y: Tensor, plan: Tensor, sigma: float) -> Tensor:

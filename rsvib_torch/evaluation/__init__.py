@@ -1,4 +1,4 @@
-"""How good a result is, and how good it can be: image quality, MTF, offset errors, Cramér-Rao bound, test targets."""
+"""How good a result is, and how good it can be: image quality, MTF, Cramér-Rao bound."""
 
 import lazy_loader
 

@@ -128,8 +128,7 @@ def projected_information(recording: Recording, *, margin: int = _MARGIN) -> Ten
     columns = slice(recording.origin[1], recording.origin[1] + recording.size[1])
     images = torch.fft.irfft(torch.cat(residuals, dim=-1)[0].transpose(0, 1), n=length)[..., columns]  # (P, T, R, W)
     images = (images * _shown_twice(recording)).flatten(1)
-    information: Tensor = images @ images.T
-    return information
+    return images @ images.T
 
 
 def _within_band(scene: Tensor, low: float = 0.35, high: float = 0.45) -> Tensor:
@@ -138,8 +137,7 @@ def _within_band(scene: Tensor, low: float = 0.35, high: float = 0.45) -> Tensor
     spectra = torch.fft.rfft(extend_rows(scene.T, length, hold=0.0))
     v = torch.fft.rfftfreq(length, dtype=scene.dtype, device=scene.device)
     share = 0.5 + 0.5 * torch.cos(math.pi * ((v - low) / (high - low)).clamp(0.0, 1.0))
-    smooth: Tensor = torch.fft.irfft(spectra * share, n=length)[:, : len(scene)].T
-    return smooth
+    return torch.fft.irfft(spectra * share, n=length)[:, : len(scene)].T
 
 
 class _SplineKernels(RowKernels):
@@ -201,10 +199,9 @@ def gradient_information(recording: Recording, noise: float | None = None) -> Te
     """The information in closed form, row by row, for unit noise.
 
     ``J = sum_s sum_p (d_p - d)' M(s) (d_p - d)``: M(s) sums the gradient products of scene row s, d_p are the
-    derivatives of its displacement in frame p and d their mean. For two frames this is half of what the derivatives of
-    the offset give. Blur within the exposure and the extent of interpolation kernels are neglected. With the standard
-    deviation of the ``noise``, gradients are weighted by ``T S / (T S + N)``, which is small for frequencies below the
-    noise: the scene is a random Gaussian one with the power spectrum S of this one, N is the power of the noise.
+    derivatives of its displacement in frame p and d their mean. Blur within the exposure and the extent of
+    interpolation kernels are neglected. With the standard deviation of the ``noise``, gradients are weighted by ``T S /
+    (T S + N)``: the scene is a random Gaussian one with the power spectrum S of this one, N is the power of the noise.
     Without it, the scene is unknown and deterministic.
     """
     timing, count = recording.timing, recording.num_frames
@@ -230,8 +227,7 @@ def gradient_information(recording: Recording, noise: float | None = None) -> Te
     mean = (seen[..., None] * sensitivity).sum(2, keepdim=True) / seen.sum(1).clamp(min=1e-300)[:, None, None]
     shared = seen * ((seen > 0).sum(1, keepdim=True) > 1)
     relative = sensitivity - mean
-    information: Tensor = torch.einsum("psta,st,sab,qstb->pq", relative, shared, products, relative)
-    return information
+    return torch.einsum("psta,st,sab,qstb->pq", relative, shared, products, relative)
 
 
 def _gradient_products(scene: Tensor, factors: Tensor, window: Tensor, noise: float | None, num_frames: int) -> Tensor:
@@ -259,8 +255,7 @@ def _gradient_products(scene: Tensor, factors: Tensor, window: Tensor, noise: fl
         weighted = images(slopes * (power / (power + noise**2 * spectrum.numel())))
     derivatives, weighted = (torch.einsum("isx,sxia->asx", values, factors) for values in (gradients, weighted))
     products = torch.einsum("asx,sx,bsx->sab", derivatives, window, weighted)
-    symmetric: Tensor = 0.5 * (products + products.transpose(-2, -1))
-    return symmetric
+    return 0.5 * (products + products.transpose(-2, -1))
 
 
 # --- Bound ---
@@ -304,8 +299,7 @@ def _deviations(information: Tensor, typical: Tensor) -> Tensor:
     shares = vectors.square()
     variance = shares @ torch.where(blind, 0.0, 1 / values.clamp(min=least))
     variance = torch.where(shares @ blind.double() > least, math.inf, variance)
-    deviations: Tensor = variance.sqrt() * scale
-    return deviations
+    return variance.sqrt() * scale
 
 
 @checks_arguments
@@ -322,12 +316,11 @@ def cramer_rao_bound(
 ) -> VibrationStd:
     """Cramér-Rao bound of the parameters of a vibration, for white Gaussian noise and an unknown scene.
 
-    No unbiased estimate has a smaller standard deviation. With D the derivatives of the frames by the parameters and
-    A the operator that forms the frames, ``J = D' (1 - A (A' A)^-1 A') D / noise^2`` is the information if the scene is
-    unknown too, and the bound is the root of the diagonal of its inverse.
-    All parameters are unknown together: amplitude, frequency and phase (at the time origin) of all tones, and the
-    image motion, of all axes of the motion: x and y, with three or four axes also roll and zoom, tones of amplitude 0
-    included in the image motion only. ``docs/bound.md`` has the derivation.
+    No unbiased estimate has a smaller standard deviation. With D the derivatives of the frames by the parameters and A
+    the operator that forms the frames, ``J = D' (1 - A (A' A)^-1 A') D / noise^2`` is the information if the scene is
+    unknown too, and the bound is the root of the diagonal of its inverse. All parameters are unknown together:
+    amplitude, frequency and phase (at the time origin) of all tones of an amplitude above 0, and the image motion, of
+    all axes of the motion. ``docs/bound.md`` has the derivation.
 
     Args:
         scene: (H, W) noise-free still scene, floating point, full scale 1, larger than the frames.
@@ -338,8 +331,7 @@ def cramer_rao_bound(
         frame_size: (height, width) of the frames, as in ``simulate_frames``.
         method: ``"projection"``, exact for an unknown deterministic scene; ``"gradients"``, its closed approximation
             row by row, several times faster; or ``"random"``, the same for a random Gaussian scene with the power
-            spectrum of this one: larger if part of the spectrum is below the noise, since the scene is estimated
-            from the same frames.
+            spectrum of this one: larger if part of the spectrum is below the noise.
         acceleration: Whether the image acceleration is unknown as well (else it is known).
 
     Returns:

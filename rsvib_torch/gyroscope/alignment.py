@@ -31,10 +31,9 @@ from rsvib_torch.frames.orientation import (
     reasons_from_row_order,
     sequence_from_row_order,
 )
-from rsvib_torch.gyroscope.clock_range import offset_range, outside
 from rsvib_torch.gyroscope.corner_tracks import corner_tracks
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
-from rsvib_torch.gyroscope.rotation_alignment import RotationAlignment, align_rates
+from rsvib_torch.gyroscope.rotation_alignment import RotationAlignment, align_rates, offset_range, outside
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.spline import FreeMotion
@@ -67,17 +66,6 @@ class ClockAlignment(
         unexplained: (2,) px, rms displacement of rows that the aligned motion does not explain, beyond their noise.
         reliable: Whether the recording explains the measurements, at this offset only.
         findings: Each ``Reason`` why not; ``reasons`` has their texts.
-
-    Example:
-        >>> import torch
-        >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.datasets import example_frames
-        >>> frames, timing, vibration = example_frames()
-        >>> times = torch.linspace(0.0, 0.05, 101, dtype=torch.float64)
-        >>> recorded = rsv.FreeMotion.from_samples(times, vibration.displacement(times))
-        >>> found = rsv.align_motion(frames, timing, recorded, offsets=(-0.004, 0.004))
-        >>> abs(found.offset) < 1e-4  # s: the clocks agree
-        True
     """
 
     motion: FreeMotion
@@ -345,10 +333,7 @@ def best_offset(
 def fit_clock(
     measured: Measurements, recorded: FreeMotion, clock: FittedClock, fit_scale: bool, fit_gain: bool
 ) -> tuple[FittedClock, Array]:
-    """Gauss-Newton on clock reading, scale, gain and drift, from start values.
-
-    Returns the fitted values and their covariance (6, 6): clock reading, scale, gain and drift of x and y.
-    """
+    """Gauss-Newton on clock reading, scale, gain and drift, from start values; also their covariance (6, 6)."""
     starts = measured.exposure_starts
     free = np.array([True, fit_scale, fit_gain, fit_gain, True, True])
     for _ in range(12):

@@ -52,11 +52,8 @@ def corner_tracks(
     """Follow the corners of frames to the next ones.
 
     Frames are given with their number, as grey pixels (H, W) in image axes, and with a mask (H, W), False at missing
-    pixels, or None. A frame is compared with the one before if their numbers follow each other; the exposures of all
-    frames start at ``starts`` in s.
-
-    Raises:
-        ValueError: If fewer than half of the pairs of frames have enough corners.
+    pixels, or None; their exposures start at ``starts`` in s. A frame is compared with the one before if their numbers
+    follow each other. Refused are frames of which fewer than half of the pairs have enough corners.
     """
     follower = CornerFollower(timing, most=_MOST_CORNERS, consistent=False)
     levels: tuple[float, float] | None = None
@@ -88,10 +85,7 @@ def tracks_of_pairs(
 ) -> CornerTracks:
     """The corners of pairs of frames (height, width) = ``size``, by the number of the earlier frame.
 
-    The exposures of all frames start at ``starts`` in s.
-
-    Raises:
-        ValueError: If there are none, or fewer than half of the pairs have enough corners.
+    The exposures of all frames start at ``starts`` in s. Refused as in ``corner_tracks``.
     """
     if not followed:
         raise ValueError("no two different frames follow each other")

@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from rsvib_torch.checks.values import needed_package
-from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, orientation_matrix
-from rsvib_torch.gyroscope.text_logs import angular_rates, check_orientation
+from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, angular_rates
 from rsvib_torch.numerics.tables import Array
 
 _MAX_PACKETS = 10**5  # 28 hours; cameras write one per second
@@ -49,8 +48,7 @@ def read_gpmf(path: Path) -> AngularRates:
     source = f"{path.name}, GPMF track, {len(parts)} packets" + (f", axes {orientation}" if orientation else "")
     if any(part.stabilised for part in parts):
         source += ", images that the camera has stabilised (IORI)"
-    rates = rates @ orientation_matrix(orientation).numpy().T if orientation else rates
-    return angular_rates(path, _sample_times(parts), rates, source)
+    return angular_rates(path, _sample_times(parts), rates, source, orientation or "XYZ")
 
 
 @dataclass(frozen=True)
@@ -72,9 +70,9 @@ class CameraTrack:
 
 
 def read_camera_track(path: Path) -> CameraTrack | None:
-    """What the GPMF track of a video states about its frames; None for other files, without one, or a damaged one.
+    """What the GPMF track of a video states about its frames; None for other files and without a track.
 
-    A damaged one causes a ``UserWarning``.
+    A damaged one causes a ``UserWarning``, and is not used.
     """
     if not path.is_file():
         return None
@@ -236,8 +234,6 @@ def _part(stream: bytes, packet: _Packet, earliest: float | None) -> _Part | Non
         raise IndexError("GYRO with a wrong SCAL")
     letters = next((content for name, *_, content in _entries(stream) if name == b"ORIN"), b"")
     orientation = letters.decode("latin-1").strip("\0 ")
-    if orientation:
-        check_orientation(orientation)
     samples = None if total is None else int(total[0, 0])
     return _Part(rates / scale, packet.start, packet.duration, _stamp(stream), earliest, samples, orientation)
 
@@ -245,11 +241,10 @@ def _part(stream: bytes, packet: _Packet, earliest: float | None) -> _Part | Non
 def _sample_times(parts: list[_Part]) -> Array:
     """Times (N,) in s of the samples of all packets.
 
-    As in ``GetGPMFSampleRate`` of gpmf-parser, the reference implementation of the manufacturer: the clock of stamps
-    (STMP) starts anywhere, and the earliest stamp of the first packet is the start of that packet. Without stamps, the
-    samples up to the end of a packet were taken until then, and the gyroscope is regular: a straight line. The first
-    packet may begin late, and the last may end early. Ticks (TICK) are not used: they are times of the operating
-    system (gpmf-parser issue 63), in ms.
+    As in ``GetGPMFSampleRate`` of gpmf-parser, the reference implementation: the clock of stamps (STMP) starts
+    anywhere, and the earliest stamp of the first packet is the start of that packet. Without stamps, the samples up to
+    the end of a packet were taken until then: a straight line. The first packet may begin late, and the last may end
+    early. Ticks (TICK) are not used: they are times of the operating system in ms (gpmf-parser issue 63).
     """
     counts = np.array([len(part.rates) for part in parts])
     ends = np.cumsum(counts)

@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,15 +17,11 @@ from rsvib_torch.checks.values import check_number
 from rsvib_torch.files.number_table import MAX_SAMPLES
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.results.presentation import Result
-from rsvib_torch.text import text_table
+from rsvib_torch.text import quoted, text_table
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class AngularRates(
-    Result,
-    units={"times": "s", "rates": "rad/s"},
-    shapes={"times": "N", "rates": "N 3"},
-):
+class AngularRates(Result, units={"times": "s", "rates": "rad/s"}, shapes={"times": "N", "rates": "N 3"}):
     """Angular rates of a gyroscope about its three axes, in rad/s.
 
     Attributes:
@@ -150,13 +147,21 @@ def _running_product(quaternions: Array) -> Array:
 
 
 def orientation_matrix(name: str) -> Tensor:
-    """(3, 3) matrix from rates about the axes of the gyroscope to those about the axes of the camera.
-
-    Example:
-        >>> orientation_matrix("YxZ").tolist()
-        [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
-    """
+    """(3, 3) matrix from rates about the axes of the gyroscope to those about the axes of the camera, e.g. "YxZ"."""
+    if sorted(name.lower()) != ["x", "y", "z"]:
+        raise ValueError(
+            f"orientation must have x, y and z once each, a small letter for a negative axis, got {quoted(name)}"
+        )
     matrix = torch.zeros(3, 3, dtype=torch.float64, device="cpu")
     for row, letter in enumerate(name):
         matrix[row, "xyz".index(letter.lower())] = 1.0 if letter.isupper() else -1.0
     return matrix
+
+
+def angular_rates(path: Path, times: Array, rates: Array, source: str, orientation: str = "XYZ") -> AngularRates:
+    """The result of a reader, for rates about the axes of an orientation; errors of its values name the file."""
+    try:
+        turned = torch.from_numpy(rates @ orientation_matrix(orientation).numpy().T)
+        return AngularRates(torch.from_numpy(times.copy()), turned, source)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error

@@ -51,16 +51,6 @@ class MotionCheck(
         times: (N,) s, exposure starts of the registered row bands in the earlier frame of their pair.
         offsets: (N, 2) px, offsets of these bands, axes (x, y).
         residual: (N, 2) px, these offsets less those of the motion.
-
-    Example:
-        >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.datasets import example_frames
-        >>> frames, timing, vibration = example_frames()
-        >>> print(rsv.check_motion(frames, timing, vibration))
-        axis  offset between frames (px rms)  without the motion (px rms)
-        x     2.36                            0.0661
-        y     0.576                           0.0953
-        the motion reduces the offsets
     """
 
     before: Tensor
@@ -119,9 +109,11 @@ def check_motion(frames: FramesOrFiles, timing: SensorTiming, motion: Motion, op
         >>> import rsvib_torch as rsv
         >>> from rsvib_torch.datasets import example_frames
         >>> frames, timing, vibration = example_frames()
-        >>> check = rsv.check_motion(frames, timing, vibration)
-        >>> check.helps, bool((check.after < 0.2 * check.before).all())
-        (True, True)
+        >>> print(rsv.check_motion(frames, timing, vibration))
+        axis  offset between frames (px rms)  without the motion (px rms)
+        x     2.36                            0.0661
+        y     0.576                           0.0953
+        the motion reduces the offsets
     """
     if not isinstance(motion, Motion):
         raise TypeError(f"motion must be a Motion, got {described(motion)}")

@@ -7,16 +7,19 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from rsvib_torch.checks.values import check_number
 from rsvib_torch.detection.verdict import recording_reasons
-from rsvib_torch.gyroscope.clock_range import offset_range, outside
 from rsvib_torch.gyroscope.corner_tracks import CornerTracks
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, orientation_matrix
-from rsvib_torch.gyroscope.rotation_fit import NAMES, RotationFit, RotationModel, components_of, fit_robustly
-from rsvib_torch.gyroscope.rotation_search import (
-    OrientationSearch,
-    Start,
-    search_orientations,
+from rsvib_torch.gyroscope.rotation_fit import (
+    NAMES,
+    RotationFit,
+    RotationModel,
+    components_of,
+    fit_robustly,
+    image_components,
 )
+from rsvib_torch.gyroscope.rotation_search import OrientationSearch, Start, search_orientations
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
@@ -140,6 +143,34 @@ class RotationAlignment(
         )
 
 
+def offset_range(
+    start: float, end: float, first: float, last: float, limits: tuple[float, float] | None
+) -> tuple[float, float]:
+    """Range of offsets in s, within ``limits``, for which a recording covers the time from ``first`` to ``last``."""
+    low, high = start - first, end - last
+    if high < low:
+        raise ValueError(
+            f"the recording of {end - start:.7g} s is shorter than the frames, which take {last - first:.7g} s with "
+            "their readout; use fewer frames, or check the unit of its times"
+        )
+    if limits is not None:
+        bounds = (check_number("offsets", limits[0]), check_number("offsets", limits[1]))
+        if bounds[1] < low or bounds[0] > high or bounds[1] < bounds[0]:
+            raise ValueError(
+                f"offsets {bounds[0]:g} to {bounds[1]:g} s: the recording covers the frames from {low:.6g} to "
+                f"{high:.6g} s"
+            )
+        low, high = max(low, bounds[0]), min(high, bounds[1])
+    return low, high
+
+
+def outside(offset: float, std: float, limits: tuple[float, float] | None) -> list[Reason]:
+    """The reason against an offset in s outside ``limits`` by more than 4 standard deviations."""
+    if limits is None or limits[0] - 4 * std <= offset <= limits[1] + 4 * std:
+        return []
+    return [Reason("offset_outside", None, offset, limits[0] if offset < limits[0] else limits[1])]
+
+
 def align_rates(
     tracks: CornerTracks,
     starts: Tensor,
@@ -153,9 +184,9 @@ def align_rates(
     fit_focal_length: bool = True,
     fit_row_time: bool = False,
 ) -> RotationAlignment:
-    """``align_motion`` for angular rates, from the corners of pairs of frames.
+    """``align_motion`` for angular rates, from the corners of pairs of frames of ``size`` (rows, pixels of a row).
 
-    The frames have ``size`` (rows, pixels of a row); their exposures start at ``starts`` (P, 2) in s.
+    The exposures of the frames of each pair start at ``starts`` (P, 2) in s.
     """
     height, width = size
     if camera is not None:
@@ -295,9 +326,8 @@ def _motion(fit: RotationFit, clock: Tensor, margin: int = 4) -> FreeMotion:
     low = max(int(torch.searchsorted(times, clock[0])) - margin, 0)
     high = min(int(torch.searchsorted(times, clock[1])) + margin, len(times))
     part = AngularRates(times[low:high], model.rates.rates[low:high].cpu() - parameters[:3])
-    pitch, yaw, roll = (part.attitude(float(parameters[3])) @ orientation_matrix(model.orientation).T).unbind(-1)
-    focal_length = float(parameters[5])
-    moved = torch.stack([-focal_length * yaw, focal_length * pitch, -roll], -1)
+    turned = part.attitude(float(parameters[3])) @ orientation_matrix(model.orientation).T
+    moved = image_components(turned, parameters[5])
     recorded_times = (part.times - parameters[3]) / parameters[4] + model.middle
-    camera = replace(model.camera, focal_length=focal_length)
+    camera = replace(model.camera, focal_length=float(parameters[5]))
     return FreeMotion.from_samples(recorded_times, moved, spacing=float(recorded_times.diff().median()), camera=camera)

@@ -51,10 +51,11 @@ def components_of(rates: AngularRates, orientation: str, parameters: Tensor, tim
     """(M, 3) X and Y in px and theta in rad between two times (M, 2) in s on the clock of the frames."""
     first, last = (parameters[3] + parameters[4] * (times - middle)).unbind(-1)
     turned = rates.rotation(first, last) - (last - first)[:, None] * parameters[:3]
-    return _image_components(turned @ orientation_matrix(orientation).T, parameters[5])
+    return image_components(turned @ orientation_matrix(orientation).T, parameters[5])
 
 
-def _image_components(turned: Tensor, focal_length: Tensor) -> Tensor:
+def image_components(turned: Tensor, focal_length: Tensor) -> Tensor:
+    """X and Y in px and theta in rad of rotation vectors (..., 3) of a camera."""
     pitch, yaw, roll = turned.unbind(-1)
     return torch.stack([-focal_length * yaw, focal_length * pitch, -roll], -1)
 
@@ -73,15 +74,13 @@ class RotationModel:
     def predicted(self, parameters: Tensor) -> Tensor:
         """Displacements (M, 2) in px by the rotation, for parameters (7,) in the order of ``NAMES``."""
         nodes, weights = gauss_legendre(2)  # exact for a motion of third order within an exposure
-        components = [self._components(parameters, node) for node in nodes.tolist()]
-        displaced = torch.stack([self._displaced(one, parameters) for one in components], -1)
+        displaced = torch.stack([self._displaced(parameters, node) for node in nodes.tolist()], -1)
         return displaced @ weights.to(displaced)
 
-    def _components(self, parameters: Tensor, node: float) -> Tensor:
+    def _displaced(self, parameters: Tensor, node: float) -> Tensor:
+        """Displacements (M, 2) in px at a place 0 ... 1 within the exposures."""
         times = self.tracks.times(float(parameters[6])) + node * self.exposure_time
-        return components_of(self.rates, self.orientation, parameters, times, self.middle)
-
-    def _displaced(self, components: Tensor, parameters: Tensor) -> Tensor:
+        components = components_of(self.rates, self.orientation, parameters, times, self.middle)
         camera = replace(self.camera, focal_length=float(parameters[5]))
         return camera.displacement_of_rays(components, *camera.rays(*self.tracks.place.unbind(-1)))
 
@@ -102,18 +101,14 @@ class RotationModel:
         turned = [-duration * axis for axis in torch.eye(3, dtype=duration.dtype)]
         turned += [difference(torch.ones_like(times)), difference(times - self.middle)]
         matrix = orientation_matrix(self.orientation).T
-        columns = [factors @ _image_components(one @ matrix, parameters[5])[..., None] for one in turned]
-        # the focal length by a difference; the components are proportional to it
-        step, components = 1e-4 * parameters[5], self._components(parameters, 0.5)
-        longer = torch.stack([parameters[5] + step, parameters[5] - step])
-        scaled = [components * torch.stack([f / parameters[5]] * 2 + [f / f]) for f in longer]
-        ends = [
-            self._displaced(one, torch.cat([parameters[:5], f[None], parameters[6:]]))
-            for one, f in zip(scaled, longer, strict=True)
-        ]
-        columns.append(((ends[0] - ends[1]) / (2 * step))[..., None])
+        columns = [factors @ image_components(one @ matrix, parameters[5])[..., None] for one in turned]
+        # the focal length by a difference
+        step = torch.zeros_like(parameters)
+        step[5] = 1e-4 * parameters[5]
+        longer, shorter = self._displaced(parameters + step, 0.5), self._displaced(parameters - step, 0.5)
+        columns.append(((longer - shorter) / (2 * step[5]))[..., None])
         row = difference(parameters[4] * self.tracks.rows)
-        columns.append(factors @ _image_components(row @ matrix, parameters[5])[..., None])
+        columns.append(factors @ image_components(row @ matrix, parameters[5])[..., None])
         return torch.cat(columns, -1) * torch.tensor(free), factors
 
 

@@ -52,10 +52,8 @@ class RowPSF:
 
     def centroid(self) -> Tensor:
         """Mean displacement of each row in px, (..., R, 2), axes (x, y): the first moment of its kernel."""
-        rows = torch.arange(self.weights.shape[-2], dtype=self.weights.dtype, device=self.weights.device)
-        columns = torch.arange(self.weights.shape[-1], dtype=self.weights.dtype, device=self.weights.device)
-        x = (self.weights.sum(-2) * columns).sum(-1)
-        y = (self.weights.sum(-1) * rows).sum(-1)
+        rows, columns = (torch.arange(count).to(self.weights) for count in self.weights.shape[-2:])
+        x, y = (self.weights.sum(-2) * columns).sum(-1), (self.weights.sum(-1) * rows).sum(-1)
         return torch.stack([x, y], dim=-1) + self.first_tap
 
     def dense(self) -> tuple[Tensor, tuple[int, int]]:
@@ -185,10 +183,10 @@ def form_rows(
 ) -> Tensor:
     """Form rows of frames from the spectra of the rows of a scene, which is mirrored beyond its first and last row.
 
-    The ``spectra`` (..., S, U) are those of B-spline coefficients, of ``degree`` across the rows. ``places`` (..., R,
-    N) are scene rows at the nodes of the exposures of R rows, and ``along`` (..., R, N) displacements along the rows in
-    px; ``node_weights`` (N,) sum to 1; frequencies (U,) are in cycles per px. The rows of several scenes follow each
-    other in ``spectra``; places and displacements are then (B, R, N).
+    The ``spectra`` (..., S, U) are those of B-spline coefficients, of ``degree`` across the rows; the rows of several
+    scenes follow each other. ``places`` (..., R, N) are scene rows at the nodes of the exposures of R rows, and
+    ``along`` (..., R, N) displacements along the rows in px, (B, R, N) for several scenes; ``node_weights`` (N,) sum to
+    1; frequencies (U,) are in cycles per px.
     """
     first, taps = row_taps(places, node_weights, partial(bspline_weights, degree=degree))
     source = first[..., None] + torch.arange(-(degree // 2), taps.shape[-2] - degree // 2, device=first.device)
@@ -352,7 +350,7 @@ class RowVaryingBlur(nn.Module):
 
     def A(self, x: Tensor, **kwargs: object) -> Tensor:  # noqa: N802 - name that solvers use
         """``forward`` under the name that solvers use; their further keywords are ignored."""
-        return self(x)  # type: ignore[no-any-return]
+        return self(x)
 
     def A_adjoint(self, y: Tensor, **kwargs: object) -> Tensor:  # noqa: N802 - name that solvers use
         """``adjoint`` for scenes with the leading dimensions of the frames and ``scene_size``."""

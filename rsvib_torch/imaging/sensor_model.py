@@ -72,19 +72,16 @@ def filtered(images: Tensor, transfer: Callable[[Tensor, Tensor], Tensor]) -> Te
 
 
 def target_optics(scale: int) -> Optics:
-    """Optics of which ``sharpened`` images have the response: pixels of the grid behind a Gaussian of half a pixel.
-
-    The MTF at the Nyquist frequency of the grid is 0.19.
-    """
+    """Optics of ``sharpened`` images: pixels of the grid behind a Gaussian of half a pixel; MTF 0.19 at Nyquist."""
     return Optics(sigma=0.5 / scale, pixel=1.0 / scale)
 
 
 def sharpened(images: Tensor, optics: Optics, scale: int) -> Tensor:
     """Restored frames (..., S H, S W) with the response of ``target_optics`` instead of that of a camera.
 
-    The restored frames are the posterior mean of the scene after the optics of the camera. The posterior mean of what
-    follows from it by a linear filter is the filtered posterior mean, so that the prior limits the gain of noise: the
-    filter is ``max(1, H_target / max(H_camera, 0.1))``. Frequencies that the camera transmits better are not changed.
+    The restored frames are the posterior mean of the scene after the optics of the camera, and that of what follows by
+    a linear filter is the filtered one, so that the prior limits the gain of noise. The filter is ``max(1, H_target /
+    max(H_camera, 0.1))``: frequencies that the camera transmits better are not changed.
     """
 
     def gain(u: Tensor, v: Tensor) -> Tensor:
@@ -142,12 +139,10 @@ class SensorNoise:
         description="Standard deviation of the gain of the pixels (photo response non-uniformity), as a fraction.",
     )
     column_offset: Fraction = Field(
-        default=0.0,
-        description="Standard deviation of the offsets of the columns as a fraction of full scale.",
+        default=0.0, description="Standard deviation of the offsets of the columns as a fraction of full scale."
     )
     row_offset: Fraction = Field(
-        default=0.0,
-        description="Standard deviation of the offsets of the rows as a fraction of full scale.",
+        default=0.0, description="Standard deviation of the offsets of the rows as a fraction of full scale."
     )
     pattern_seed: int = Field(
         default=0, ge=0, le=2**63 - 1, description="Seed of the fixed pattern; each seed is another sensor."

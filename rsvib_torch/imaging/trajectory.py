@@ -6,7 +6,6 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import math
 from typing import Literal
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,9 +13,7 @@ from rsvib_torch.checks.values import check_choice, check_whole_number
 from rsvib_torch.motion.field import check_two_axes
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
-from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.numerics.splines import gauss_legendre
-from rsvib_torch.numerics.tables import Array, cos_sin, tables, tensor
 
 Quadrature = Literal["midpoint", "gauss"]
 
@@ -26,9 +23,6 @@ def gauss_node_count(vibration: Motion, exposure_time: float, *, at_most: int = 
 
     The integrand is ``exp(-2 pi i (u X(t) + v Y(t)))`` with frequencies up to half a cycle per pixel, so the count
     grows with the path length (two nodes per px) and with the periods of the fastest tone (four nodes each).
-
-    Raises:
-        ValueError: If more than ``at_most`` nodes are necessary.
     """
     path = float(vibration.displacement_within(exposure_time).amax())
     periods = float(vibration.periods_within(exposure_time).amax())
@@ -116,39 +110,3 @@ def rows_and_displacement(
         if iteration > 0 and bool((step.abs() < 1e-5).all()):
             break
     return rows, displacement
-
-
-def shown_by_tones(
-    scene_rows: Tensor, frame_start: Tensor, timing: RowTiming, vibration: Vibration
-) -> tuple[Tensor, Tensor]:
-    """``rows_showing`` for vibrations, with displacements along x: rows and px (B, G, S) of scene rows (B, 1, S).
-
-    The displacement of few rows by vibrations (B) in row order is computed in NumPy, because each step of Newton's
-    method takes 60 operations of PyTorch; without gradients. Its slope is that of the mean displacement.
-    ``frame_start`` (B, G, 1) are the exposure starts in s of the first rows of the frames.
-    """
-    values, scene, start = tables(vibration.parameters, scene_rows, frame_start)
-    amplitude, frequency, phase = np.split(values[..., :-3], 3, -1)
-    speed, acceleration, shift = np.moveaxis(values[..., -3:], -1, 0)
-    amplitude = amplitude * np.sinc(frequency * timing.exposure_time)
-
-    def moved(middle: Array, axis: int) -> tuple[Array, Array]:
-        """Mean displacement (B, G, S) in px and its derivative in px/s at mid-exposures, along x or y."""
-        size, turn, start_of = (values[:, None, None, axis] for values in (amplitude, 2 * math.pi * frequency, phase))
-        at, by_time, by_square = (values[:, None, None, axis] for values in (shift, speed, acceleration))
-        cosine, sine = cos_sin(turn * middle[..., None] + start_of)
-        drift = at + by_time * middle + 0.5 * by_square * (np.square(middle) + timing.exposure_time**2 / 12)
-        return (size * sine).sum(-1) + drift, (size * turn * cosine).sum(-1) + by_time + by_square * middle
-
-    rows, middle = scene + np.zeros_like(start), start + 0.5 * timing.exposure_time
-    with np.errstate(over="ignore", invalid="ignore"):  # a fit that diverges may be infinite
-        for _ in range(8):
-            displacement, slope = moved(middle + rows * timing.row_time, 1)
-            # the limit keeps steps finite near slope 1
-            step = (scene + displacement - rows) / np.maximum(1 - slope * timing.row_time, 0.1)
-            rows = rows + step
-            if np.all(np.abs(step) < 1e-5):  # px; the next step would be its square
-                break
-        along, _ = moved(middle + rows * timing.row_time, 0)
-    device = vibration.device
-    return tensor(rows).to(device), tensor(along).to(device)

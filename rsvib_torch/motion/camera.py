@@ -171,22 +171,14 @@ class Camera:
         p1, p2 = self._tangential
         radial, slope = self._radial(u * u + v * v)
         mixed = u * v * slope + 2 * (p1 * u + p2 * v)
-        return torch.stack(
-            [
-                torch.stack([radial + u * u * slope + 2 * p1 * v + 6 * p2 * u, mixed], -1),
-                torch.stack([mixed, radial + v * v * slope + 6 * p1 * v + 2 * p2 * u], -1),
-            ],
-            -2,
-        )
+        of_u, of_v = radial + u * u * slope + 2 * p1 * v + 6 * p2 * u, radial + v * v * slope + 6 * p1 * v + 2 * p2 * u
+        return torch.stack([of_u, mixed, mixed, of_v], -1).unflatten(-1, (2, 2))
 
     def rays(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """(u, v) of the rays (u, v, 1) of image points in px from the centre of the frame, by Newton's method."""
         check_broadcast(x=x, y=y)
         x, y = torch.broadcast_tensors(1.0 * x, 1.0 * y)
-        along, across = (
-            (x - self.principal_point[0]) / self.focal_length,
-            (y - self.principal_point[1]) / self.focal_length,
-        )
+        along, across = ((p - c) / self.focal_length for p, c in zip((x, y), self.principal_point, strict=True))
         if not self.distorts:
             return along, across
         if self.fisheye:
@@ -219,15 +211,11 @@ class Camera:
         x = torch.linspace(-0.5, 0.5, 33, dtype=torch.float64) * width
         y = torch.linspace(-0.5, 0.5, 33, dtype=torch.float64)[:, None] * height
         u, v = self.rays(x, y)
-        back = self._distorted(u, v)
-        px = self.focal_length * torch.stack([u, v])
-        missed = max(
-            float((self.focal_length * back[k] + self.principal_point[k] - at).abs().amax())
-            for k, at in ((0, x), (1, y))
-        )
+        back = zip(self._distorted(u, v), self.principal_point, (x, y), strict=True)
+        missed = max(float((self.focal_length * found + centre - at).abs().amax()) for found, centre, at in back)
         folded = bool((torch.linalg.det(self._distortion_slope(u, v)) <= 0).any())
         names = "k1, k2, k3, k4" if self.fisheye else "k1, k2, p1, p2, k3"
-        if folded or not bool(torch.isfinite(px).all()) or not missed < 1e-6:
+        if folded or not bool(torch.isfinite(torch.stack([u, v])).all()) or not missed < 1e-6:
             raise ValueError(
                 f"distortion {self.distortion} with focal_length={self.focal_length:g} px is not invertible in frames "
                 f"of {width} x {height} px: check the order ({names}) and the size of the frames of the "
@@ -235,12 +223,9 @@ class Camera:
             )
 
     def displacement(self, components: Tensor, x: Tensor, y: Tensor) -> Tensor:
-        """Displacement (S, 2) in px of content at (x, y) px (S) from the centre, by components (S, A) of a motion.
+        """Displacement (S, 2) in px of content at rest at (x, y) px (S) from the centre, by components (S, A).
 
-        Args:
-            components: X and Y in px, roll theta in rad and zoom, A = 2 to 4.
-            x: px, position at rest.
-            y: The same along y.
+        The components are X and Y in px, roll theta in rad and zoom, A = 2 to 4.
         """
         check_broadcast(components=_first(components), x=x, y=y)
         return self.displacement_of_rays(components, *self.rays(x.to(components), y.to(components)))
@@ -248,8 +233,7 @@ class Camera:
     def displacement_of_rays(self, components: Tensor, u: Tensor, v: Tensor) -> Tensor:
         """``displacement`` of the content at the rays (u, v, 1)."""
         check_broadcast(components=_first(components), u=u, v=v)
-        pitch, yaw = components[..., 1] / self.focal_length, components[..., 0] / -self.focal_length
-        roll = -components[..., 2] if components.shape[-1] > 2 else torch.zeros_like(pitch)
+        pitch, yaw, roll = self.attitude(components).unbind(-1)
         # Rodrigues: R(-w) r = cos a r - sinc(a) w x r + (1 - cos a) / a^2 w (w . r), a = |w|
         squared = pitch.square() + yaw.square() + roll.square()
         angle = squared.sqrt() if not components.requires_grad else (squared + 1e-300).sqrt()
@@ -277,9 +261,7 @@ class Camera:
         u, v = self.rays(x, y)
         x, y = torch.broadcast_tensors(x.to(u), y.to(u))
         f = self.focal_length
-        rotation = torch.stack(
-            [torch.stack([1 + u * u, u * v, -f * v], -1), torch.stack([u * v, 1 + v * v, f * u], -1)], -2
-        )
+        rotation = torch.stack([1 + u * u, u * v, -f * v, u * v, 1 + v * v, f * u], -1).unflatten(-1, (2, 3))
         moved = self._distortion_slope(u, v) @ rotation
         zoomed = torch.stack([x - self.principal_point[0], y - self.principal_point[1]], -1)
         return torch.cat([moved, zoomed[..., None]], -1)[..., :axes]
@@ -291,6 +273,6 @@ class Camera:
             >>> Camera(1000.0).attitude(torch.tensor([-2.0, 1.0, 1e-3], dtype=torch.float64)).tolist()
             [0.001, 0.002, -0.001]
         """
-        angles = [components[..., 1] / self.focal_length, -components[..., 0] / self.focal_length]
-        roll = -components[..., 2] if components.shape[-1] > 2 else torch.zeros_like(angles[0])
-        return torch.stack([*angles, roll], -1)
+        pitch, yaw = components[..., 1] / self.focal_length, -components[..., 0] / self.focal_length
+        roll = -components[..., 2] if components.shape[-1] > 2 else torch.zeros_like(pitch)
+        return torch.stack([pitch, yaw, roll], -1)

@@ -8,14 +8,7 @@ from torch.nn import functional
 
 from rsvib_torch.checks.values import described
 from rsvib_torch.files.reading import Table
-from rsvib_torch.motion.vibration import (
-    Vibration,
-    VibrationStd,
-    image_motion_line,
-    tone_head,
-    tone_places,
-    tone_rows,
-)
+from rsvib_torch.motion.vibration import Vibration, VibrationStd, image_motion_line, tone_head, tone_places, tone_rows
 from rsvib_torch.results.presentation import (
     AXIS_NAMES,
     PHYSICAL_HEAD,
@@ -90,9 +83,7 @@ class DetectedVibration(
         """Amplitudes of displacement, velocity and acceleration of the tones of x and y, for a pixel size in m."""
         rows = []
         for at, labels in tone_places(self.vibration):
-            amplitude, frequency = (
-                float(values[at]) for values in (self.vibration.amplitude, self.vibration.frequency)
-            )
+            amplitude, frequency = float(self.vibration.amplitude[at]), float(self.vibration.frequency[at])
             if at[-2] < 2 and amplitude > 0:
                 relative = float(self.std.amplitude[at]) / amplitude
                 values = physical_tone(amplitude, frequency, pixel_size).values()

@@ -30,10 +30,6 @@ def displacement_factors(x: Tensor, y: Tensor, axes: int, camera: Camera | None 
     """Displacement by unit components at positions of the scene: ``((1, 0, -y, x), (0, 1, x, y))``, (S, 2, A).
 
     Positions (S) are in px from the centre of the frame. With a camera, the factors are those of small angles.
-
-    Example:
-        >>> displacement_factors(torch.tensor(100.0), torch.tensor(-50.0), 3).tolist()
-        [[1.0, 0.0, 50.0], [0.0, 1.0, 100.0]]
     """
     if camera is not None:
         return camera.factors(x, y, axes)
@@ -77,8 +73,7 @@ def largest_slope(components: Tensor, width: int, height: int, camera: Camera | 
     x, y = _corners(width, height, components)
     axes = components.shape[-1]
     along = displacement_factors(x, y, axes, camera) - displacement_factors(x - x.sign(), y, axes, camera)
-    slope: Tensor = (along.abs().amax(0) @ components[..., None])[..., 0].amax(-1)
-    return slope
+    return (along.abs().amax(0) @ components[..., None])[..., 0].amax(-1)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -155,8 +150,7 @@ class ColumnMotion(Motion):
         x, y = torch.broadcast_tensors(self.column[..., None], 0.55 * self.num_rows * nodes)
         values = torch.stack(camera.rays(x, y), -2)
         powers = nodes[:, None] ** torch.arange(degree + 1, device=self.device)
-        coefficients: Tensor = values @ torch.linalg.pinv(powers).mT
-        return coefficients
+        return values @ torch.linalg.pinv(powers).mT
 
     def _rays(self, camera: Camera, starts: Tensor, components: Tensor) -> tuple[Tensor, Tensor]:
         """Rays u and v (S) of the content of rows exposed from ``starts`` (S) on, at components (S, A)."""

@@ -22,14 +22,12 @@ class Motion(Result, ABC):
     """Motion of the image on the sensor as a function of time: scene content at ``s`` appears at ``s + D(t)``.
 
     Contract of a motion type. It is a frozen dataclass (``eq=False, repr=False``) whose fields are float64 tensors that
-    begin with the batch dimensions, other motions of the same batch shape, and plain numbers that hold for the whole
-    batch. It implements the abstract members below; everything else follows from them. The last axis of every result
-    counts the components of the motion: x and y in px, positive to the right and down, then roll in rad and zoom
-    (relative) if there are three or four (see ``motion.field``). Methods that take
-    times accept tensors of any shape S whose leading dimensions are the batch dimensions (or 1), in seconds since the
-    exposure start of row 0 of frame 0, return float64 tensors (S, axes), and are differentiable with respect to tensors
-    that require gradients. Bounds are not differentiable. A motion is an immutable value: methods that change it return
-    another one.
+    begin with the batch dimensions, other motions of the same batch shape, and plain numbers for the whole batch. It
+    implements the abstract members below. The last axis of every result counts the components: x and y in px, positive
+    to the right and down, then roll in rad and zoom (relative) if there are three or four (see ``motion.field``). Times
+    have any shape S whose leading dimensions are the batch dimensions (or 1), in seconds since the exposure start of
+    row 0 of frame 0; results (S, axes) are float64, and differentiable except for bounds. A motion is an immutable
+    value.
     """
 
     @property
@@ -72,8 +70,8 @@ class Motion(Result, ABC):
     def displacement_within(self, duration: float) -> Tensor:
         """Bound on the displacement between two times ``duration`` seconds apart, (..., axes), in px (Eq. 24).
 
-        A tone counts with 4 A per period beyond half a period, its path length, on which quadrature depends; image
-        motion counts with its velocity at the time origin.
+        A tone counts with 4 A per period beyond half a period, its path length; image motion with its velocity at time
+        0.
         """
 
     @abstractmethod
@@ -120,10 +118,10 @@ class Motion(Result, ABC):
         return self.displacement(starts.to(dtype=torch.float64, device=self.device)[..., None] + delays)
 
     def offset(self, starts: Tensor, later_starts: Tensor, exposure_time: float) -> Tensor:
-        """Offset: mean displacement of the later exposure minus that of the earlier one, in px (Eq. 4), (S, axes).
+        """Offset (Eq. 4): mean displacement of the later exposure minus that of the earlier one, in px, (S, axes).
 
-        Eq. (4) as printed gives this sign on its right-hand side, and the opposite one on its left-hand side. Starts S
-        in s are those of the same scene rows in frames p and p + 1.
+        Starts S in s are those of the same scene rows in two frames. The left-hand side of Eq. (4) has the opposite
+        sign.
         """
         check_broadcast(starts=starts, later_starts=later_starts)
         return self.mean_displacement(later_starts, exposure_time) - self.mean_displacement(starts, exposure_time)

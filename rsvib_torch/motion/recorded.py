@@ -63,14 +63,12 @@ def read_motion(
 
     Example:
         >>> import tempfile
-        >>> import torch
         >>> from pathlib import Path
         >>> import rsvib_torch as rsv
         >>> path = Path(tempfile.mkdtemp()) / "gyroscope.csv"
         >>> rows = [f"{0.001 * i},{0.1 * i},{-0.2 * i}" for i in range(50)]
         >>> _ = path.write_text(chr(10).join(["time,x,y", *rows]))
-        >>> motion = rsv.read_motion(path, unit="px")
-        >>> motion.displacement(torch.tensor(0.01)).round(decimals=3).tolist()  # px, without the mean
+        >>> rsv.read_motion(path, unit="px").displacement(torch.tensor(0.01)).round(decimals=3).tolist()  # px
         [-1.45, 2.9]
     """
     path = Path(path)

@@ -31,10 +31,10 @@ def recorded_offsets(
 ) -> tuple[Array, Array]:
     """How far (x, y) from each pixel of the restored frame it was recorded, (2, n, m) px, and weights (m, length).
 
-    Content that is at rest at s - shift in a frame was recorded at ``q = s - shift + D(s - shift, t(q))`` with the
-    mean displacement D during the exposure of the row of q. Rows in the order of the sensor are n. Along them, the
-    offsets at all pixels are ``offsets @ weights``, a polynomial through m columns of which the first and the last are
-    those of the frame; where all columns are displaced alike, there is one.
+    Content that is at rest at s - shift was recorded at ``q = s - shift + D(s - shift, t(q))`` with the mean
+    displacement D during the exposure of the row of q. Rows in the order of the sensor are n. Along them, the offsets
+    at all pixels are ``offsets @ weights``, a polynomial through m columns from the first to the last; where all
+    columns are displaced alike, there is one.
     """
     height, width = size
     along, across = (1, 0) if timing.scan_axis == -2 else (0, 1)  # axes (x, y) along which rows follow, and along rows
@@ -68,18 +68,6 @@ def _interpolation(length: int, count: int) -> tuple[Array, Array]:
     nodes, series = -np.cos(np.pi * np.arange(count) / max(count - 1, 1)), np.polynomial.chebyshev.chebvander
     weights = series(np.linspace(-1.0, 1.0, length), count - 1) @ np.linalg.inv(series(nodes, count - 1))
     return 0.5 * (length - 1) * (nodes + 1), weights.T
-
-
-def source_map(
-    motion: Motion,
-    timing: SensorTiming,
-    size: tuple[int, int],
-    frame: int = 0,
-    shift: Tensor | None = None,
-    dtype: Any = np.float32,
-) -> Array:
-    """(2, H, W) px, the place (x, y) in a frame where each pixel of the restored frame was recorded."""
-    return places(*recorded_offsets(motion, timing, size, frame, shift), timing, size, dtype)
 
 
 def places(

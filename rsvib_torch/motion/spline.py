@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import ClassVar, Self
 
 import numpy as np
@@ -74,33 +74,26 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
             )
         if not bool(torch.isfinite(values).all()):
             raise ValueError("coefficients must be finite")
-        if float(values.detach().abs().max()) > MAX_DISPLACEMENT:
-            largest = float(values.detach().abs().max())
+        largest = float(values.detach().abs().max())
+        if largest > MAX_DISPLACEMENT:
             raise ValueError(f"coefficients must be at most {MAX_DISPLACEMENT:g} px, got {largest:g}")
         axes = values.shape[-2]
-        tones = (
-            Vibration.still(values.shape[:-2], values.device, axes=axes) if tones is None else tones.to(values.device)
-        )
+        tones = Vibration.still(values.shape[:-2], axes=axes) if tones is None else tones
+        tones = tones.to(values.device)
         if tones.batch_shape != values.shape[:-2] or tones.num_axes != axes:
             raise ValueError(
                 f"tones of batch shape {tuple(tones.batch_shape)} and {tones.num_axes} axes do not fit coefficients "
                 f"{tuple(values.shape)}"
             )
-        object.__setattr__(self, "coefficients", values)
-        object.__setattr__(
-            self, "start", check_number("start", start, at_least=-MAX_START_TIME, at_most=MAX_START_TIME)
-        )
-        object.__setattr__(self, "spacing", check_number("spacing", spacing, at_least=MIN_ROW_TIME))
-        object.__setattr__(self, "tones", tones)
-        object.__setattr__(self, "camera", tones.camera if camera is None else camera)
+        start = check_number("start", start, at_least=-MAX_START_TIME, at_most=MAX_START_TIME)
+        spacing = check_number("spacing", spacing, at_least=MIN_ROW_TIME)
+        camera = tones.camera if camera is None else camera
+        for field, value in zip(fields(self), (values, start, spacing, tones, camera), strict=True):
+            object.__setattr__(self, field.name, value)
 
     @classmethod
     def through(
-        cls,
-        times: TensorLike,
-        displacement: TensorLike,
-        tones: Vibration | None = None,
-        camera: Camera | None = None,
+        cls, times: TensorLike, displacement: TensorLike, tones: Vibration | None = None, camera: Camera | None = None
     ) -> "FreeMotion":
         """The motion that passes through displacements (N, A) in px at evenly spaced times (N,) in seconds.
 
@@ -143,9 +136,8 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         grid, values = as_numbers("times", times).cpu(), as_numbers("displacement", displacement).cpu()
         for name, given in (("times", grid), ("displacement", values)):
             if given.requires_grad:
-                raise ValueError(
-                    f"from_samples has no gradient: pass {name}.detach(), or evenly spaced times to through"
-                )
+                remedy = f"pass {name}.detach(), or evenly spaced times to through"
+                raise ValueError(f"from_samples has no gradient: {remedy}")
         _check_samples(grid, values)
         steps = np.diff(grid.numpy())
         if (steps <= 0).any():
@@ -274,10 +266,8 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
 
     def rest(self, times: Tensor) -> Tensor:
         """R(t) alone in px; arguments and shapes as in ``displacement``."""
-        times = times.to(dtype=torch.float64, device=self.device)
-        taps, fraction = self._taps(times)
-        value: Tensor = (taps * bspline_weights(fraction, 3)[..., None, :]).sum(-1)
-        return value
+        taps, fraction = self._taps(times.to(dtype=torch.float64, device=self.device))
+        return (taps * bspline_weights(fraction, 3)[..., None, :]).sum(-1)
 
     def drift(self, times: Tensor) -> Tensor:
         """Displacement of the image motion alone in px; arguments and shapes as in ``displacement``."""
@@ -310,12 +300,8 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         """Velocity dD/dt in px/s; arguments and shapes as in ``displacement``."""
         times = times.to(dtype=torch.float64, device=self.device)
         taps, fraction = self._taps(times)
-        fraction = fraction[..., None]
-        slopes = torch.cat(
-            [0.5 * (1 - fraction).square(), 0.75 - (fraction - 0.5).square(), 0.5 * fraction.square()], -1
-        )
         inside = ((times > self.start) & (times < self.end))[..., None]
-        moving = (taps.diff(dim=-1) * slopes[..., None, :]).sum(-1) / self.spacing
+        moving = (taps * bspline_weights(fraction, 3, derivative=1)[..., None, :]).sum(-1) / self.spacing
         return self.tones.velocity(times) + torch.where(inside, moving, 0.0)
 
     def largest_oscillation(self) -> Tensor:

@@ -112,12 +112,10 @@ class SensorTiming:
         if type(self.scan_axis) not in (int, str) or self.scan_axis not in _SCAN_AXES:
             raise ValueError(f"scan_axis must be -2 ('y') or -1 ('x'), got {described(self.scan_axis)}")
         check_choice("readout_direction", self.readout_direction, ("forward", "reverse"))
-        row_time_std = check_number("row_time_std", self.row_time_std, at_least=0.0, at_most=row_time)
-        object.__setattr__(self, "row_time_std", row_time_std)
-        object.__setattr__(self, "row_time", row_time)
-        object.__setattr__(self, "exposure_rows", exposure_rows)
-        object.__setattr__(self, "frame_rows", frame_rows)
-        object.__setattr__(self, "scan_axis", _SCAN_AXES[self.scan_axis])
+        checked = {"row_time": row_time, "exposure_rows": exposure_rows, "frame_rows": frame_rows}
+        checked["row_time_std"] = check_number("row_time_std", self.row_time_std, at_least=0.0, at_most=row_time)
+        for name, value in (checked | {"scan_axis": _SCAN_AXES[self.scan_axis]}).items():
+            object.__setattr__(self, name, value)
         if self.frame_start_times is not None:
             from rsvib_torch.checks.arguments import as_numbers  # noqa: PLC0415
 
@@ -155,15 +153,8 @@ class SensorTiming:
         row_time = check_number("row_time", row_time, above=0.0)
         exposure = check_number("exposure_time", exposure_time, above=0.0)
         period = 1 / check_number("frame_rate", frame_rate, above=0.0)
-        return cls(
-            row_time,
-            exposure / row_time,
-            period / row_time,
-            scan_axis,
-            readout_direction,
-            frame_start_times,
-            row_time_std,
-        )
+        others = scan_axis, readout_direction, frame_start_times, row_time_std
+        return cls(row_time, exposure / row_time, period / row_time, *others)
 
     @staticmethod
     def from_file(path: str | os.PathLike[str]) -> SensorTiming:
@@ -187,15 +178,13 @@ class SensorTiming:
     ) -> SensorTiming:
         """Timing of images of the same ground from several lines (or bands) of a push-broom sensor.
 
-        Every image is recorded line by line while the ground moves; each line records the same ground after its own
-        delay. Registered to the ground, the images are frames of a rolling shutter whose exposures start after these
-        delays: the jitter of the platform is estimated from parallax pairs, except at frequencies that are multiples of
-        one over all delays.
+        Each line records the same ground line by line after its own delay. Registered to the ground, the images are
+        frames of a rolling shutter whose exposures start after these delays: the jitter of the platform is estimated
+        from parallax pairs, except at frequencies that are multiples of one over all delays.
 
         Args:
             line_time: Time between lines, in seconds.
-            delays: Delay in seconds between the recording of the ground by the first line and by each line,
-                increasing; 0 for the first.
+            delays: Delay in s of the recording of the ground by each line, increasing; 0 for the first.
             num_lines: Number of lines of the images.
             exposure_lines: Exposure in line times, including the stages of time-delayed integration.
 
@@ -208,12 +197,7 @@ class SensorTiming:
         check_number("exposure_lines", exposure_lines, above=0.0)
         if not isinstance(delays, Sequence) or len(delays) < 2:
             raise ValueError(f"delays must have at least two entries, got {described(delays)}")
-        return cls(
-            row_time=line_time,
-            exposure_rows=exposure_lines,
-            frame_rows=max(lines, exposure_lines),
-            frame_start_times=tuple(delays),
-        )
+        return cls(line_time, exposure_lines, max(lines, exposure_lines), frame_start_times=tuple(delays))
 
     @property
     def exposure_time(self) -> float:
@@ -274,8 +258,7 @@ class SensorTiming:
     def check_span(self, num_frames: int, num_rows: int) -> None:
         """Raise a ``ValueError`` if frames are too far apart for their number of rows to resolve frequencies.
 
-        Between two frames, a vibration has a number of periods that its frequency must determine: the number of
-        frequencies that are tried, and the time and memory that they take, grow with the span.
+        The number of frequencies that are tried, and the time and memory that they take, grow with the span.
         """
         check_whole_number("num_rows", num_rows, at_least=1)
         starts = self.frame_starts(num_frames)
@@ -388,8 +371,8 @@ class _SensorFile:
 class RowTiming(SensorTiming):
     """Timing of frames in row order: rows lie on axis -2, and row 0 is read first.
 
-    ``SensorTiming.in_row_order`` returns it. Functions that work on frames, offsets or motions in row order take it
-    instead of a ``SensorTiming``, so that a type checker refuses a timing whose frames have not been turned.
+    ``SensorTiming.in_row_order`` returns it. Functions of frames, offsets or motions in row order take it, so that a
+    type checker refuses a timing whose frames have not been turned.
     """
 
     def __post_init__(self) -> None:
@@ -411,13 +394,8 @@ def check_timing(value: object) -> None:
 def row_axes(timing: SensorTiming, num_axes: int) -> tuple[list[int], list[float]]:
     """Order and signs of the components of a motion when frames are turned to row order.
 
-    Transposing frames exchanges x and y; flipping them along the rows changes the sign of y. Both are reflections and
-    change the sign of roll. Component i in row order is component ``order[i]`` in image axes times ``signs[i]``.
-
-    Example:
-        >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512, scan_axis="x")
-        >>> row_axes(timing, 3)
-        ([1, 0, 2], [1.0, 1.0, -1.0])
+    Transposing frames exchanges x and y; flipping them along the rows changes the sign of y. Both change the sign of
+    roll. Component i in row order is component ``order[i]`` in image axes times ``signs[i]``.
     """
     transposed, reverse = timing.scan_axis == -1, timing.readout_direction == "reverse"
     order = [1, 0, 2, 3] if transposed else [0, 1, 2, 3]

@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from typing import Self
 
 import torch
@@ -83,42 +82,25 @@ def _with_trailing(value: float | Tensor, dimensions: int) -> float | Tensor:
     return value[(..., *(None,) * dimensions)] if isinstance(value, Tensor) else value
 
 
-@lru_cache(maxsize=64)
-def _ranges(counts: tuple[tuple[str, int], ...], device: torch.device) -> tuple[Tensor, Tensor]:
-    """Number of values of each quantity, and its smallest and largest permitted value (2, n); do not modify them."""
-    with torch.inference_mode(False):
-        numbers = torch.tensor([count for _, count in counts], device=device)
-        high = [_LIMITS[name] for name, _ in counts]
-        low = [0.0 if name in _NOT_NEGATIVE else -_LIMITS[name] for name, _ in counts]
-        return numbers, torch.tensor([low, high], dtype=torch.float64, device=device)
-
-
 def _check_values(values: dict[str, Tensor]) -> None:
     """Raise a ValueError for values that are not finite or too large, and for negative amplitudes or frequencies."""
-    flat = torch.cat([tensor.detach().flatten() for tensor in values.values()])
-    numbers, ranges = _ranges(tuple((name, tensor.numel()) for name, tensor in values.items()), flat.device)
-    low, high = ranges.repeat_interleave(numbers, dim=1, output_size=len(flat))
-    if bool(((flat >= low) & (flat <= high)).all()):  # of all values at once: the tracker checks many small motions
-        return
-    for name, tensor in values.items():
-        if not bool(torch.isfinite(tensor).all()):
+    # one transfer: the smallest and the largest value of each quantity that is not empty, NaN if one is
+    ends = {name: torch.stack(tensor.detach().aminmax()) for name, tensor in values.items() if tensor.numel()}
+    for name, (low, high) in zip(ends, torch.stack([*ends.values()]).tolist() if ends else (), strict=True):
+        limit = _LIMITS[name]
+        if not (math.isfinite(low) and math.isfinite(high)):
             raise ValueError(f"{name} must be finite")
-        if bool((tensor.abs() > _LIMITS[name]).any()):
-            raise ValueError(
-                f"{name} must be at most {_LIMITS[name]:g} {_UNITS[name].partition(' at')[0]}, got "
-                f"{tensor.abs().max().item():g}"
-            )
-    for name in _NOT_NEGATIVE:
-        if bool((values[name] < 0).any()):
-            raise ValueError(f"{name} must not be negative, got {values[name].min().item():g}")
+        if max(-low, high) > limit:
+            unit = _UNITS[name].partition(" at")[0]
+            raise ValueError(f"{name} must be at most {limit:g} {unit}, got {max(-low, high):g}")
+        if name in _NOT_NEGATIVE and low < 0:
+            raise ValueError(f"{name} must not be negative, got {low:g}")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 @checked_methods
 class Vibration(
-    Motion,
-    units=_UNITS,
-    shapes={**dict.fromkeys(_QUANTITIES, "... A=2-4 K"), **dict.fromkeys(_POLYNOMIAL, "... A")},
+    Motion, units=_UNITS, shapes={**dict.fromkeys(_QUANTITIES, "... A=2-4 K"), **dict.fromkeys(_POLYNOMIAL, "... A")}
 ):
     """Sinusoidal displacement of the image on the sensor, with an image motion.
 
@@ -195,9 +177,8 @@ class Vibration(
         if tones[0].shape[-1] > 1:  # sorted
             order = tones[0].detach().argsort(dim=-1, descending=True, stable=True)
             tones = [tensor.take_along_dim(order, dim=-1) for tensor in tones]
-        for name, tensor in zip(
-            _LIMITS, (*tones, *(values.expand(*batch, axes) for values in polynomial)), strict=True
-        ):
+        polynomial = [values.expand(*batch, axes) for values in polynomial]
+        for name, tensor in zip(_LIMITS, (*tones, *polynomial), strict=True):
             object.__setattr__(self, name, tensor)
         object.__setattr__(self, "camera", camera)
 
@@ -215,9 +196,8 @@ class Vibration(
     def from_parameters(cls, parameters: Tensor) -> Self:
         """A batch of vibrations from one tensor, without checks and without another order of the tones.
 
-        Args:
-            parameters: (B, A, 3 K + 3) float64: amplitudes, frequencies and phases of the K tones, largest first, then
-                image motion, image acceleration and image shift.
+        The parameters are (B, A, 3 K + 3) float64: amplitudes, frequencies and phases of the K tones, largest first,
+        then image motion, image acceleration and image shift.
         """
         tones = (parameters.shape[-1] - 3) // 3
         *of_tones, polynomial = parameters.split([tones, tones, tones, 3], -1)
@@ -314,8 +294,7 @@ class Vibration(
 
     def _at(self, times: Tensor, values: Tensor) -> Tensor:
         """Values (..., A) for each motion, to broadcast with times (S, 1)."""
-        shape = (*self.batch_shape, *(1,) * (times.ndim - 1 - len(self.batch_shape)), self.amplitude.shape[-2])
-        return values.reshape(shape)
+        return values.reshape(*self.batch_shape, *(1,) * (times.ndim - 1 - len(self.batch_shape)), -1)
 
     def drift(self, times: Tensor) -> Tensor:
         """Displacement v t + a t^2 / 2 of the image motion alone in px; arguments and shapes as in ``displacement``."""
@@ -362,9 +341,7 @@ class Vibration(
         return self.amplitude.detach().sum(-1) + self.image_shift.detach().abs()
 
     def displacement_within(self, duration: float) -> Tensor:
-        """Bound on the displacement between two times ``duration`` apart, (..., 2), in px (Eq. 24, sum of tones).
-
-        Beyond half a period a tone counts with its path length 4 A per period. Image motion counts with its velocity.
+        """Bound on the displacement between two times as in ``Motion.displacement_within`` (Eq. 24, sum of tones).
 
         Condition (24): the discrete point spread function of Eqs. (25)-(39) requires less than 0.1 px in a row time.
         """
@@ -373,9 +350,9 @@ class Vibration(
         return ((self.amplitude * path).sum(-1) + self.image_motion.abs() * duration).detach()
 
     def periods_within(self, duration: float) -> Tensor:
-        """Periods of the fastest tone in ``duration`` seconds, (..., 2); tones below 1e-4 px do not count.
+        """Periods of the fastest tone in ``duration`` seconds, (..., 2).
 
-        Roll and zoom count from 1e-7 on, which is 1e-4 px at 1000 px from the centre.
+        Tones below 1e-4 px do not count, roll and zoom below 1e-7: 1e-4 px at 1000 px from the centre.
         """
         smallest = self.amplitude.new_tensor([1e-4, 1e-4, 1e-7, 1e-7][: self.amplitude.shape[-2]])
         visible = self.amplitude > smallest[:, None]
@@ -384,8 +361,7 @@ class Vibration(
     def timed_from(self, origin: float | Tensor) -> Self:
         """The same motion with another time origin, less the constant that the image motion adds to it.
 
-        Args:
-            origin: The time origin in s from the present one: a number, or a tensor with one for each of a batch.
+        The origin is in s from the present one: a number, or a tensor with one for each of a batch.
         """
         times = self.phase.new_tensor(origin) if isinstance(origin, float) else origin
         phase = self.phase + 2 * math.pi * times[..., None, None] * self.frequency
@@ -396,10 +372,7 @@ class Vibration(
         )
 
     def with_axes(self, order: Sequence[int], signs: Sequence[float]) -> Self:
-        """The vibration whose component k is ``signs[k]`` times component ``order[k]`` of this one.
-
-        A negative sign changes the phase by pi and returns it in [-pi, pi); amplitudes stay positive.
-        """
+        """The vibration whose component k is ``signs[k]`` times component ``order[k]``; amplitudes stay positive."""
         self._check_axes(order, signs)
         sign = torch.tensor(signs, dtype=torch.float64, device=self.device)
         axes = list(order)
@@ -429,14 +402,6 @@ class VibrationStd(
     ``displacement`` (..., 2) in px is that of the displacement of the rows of the record, rms over the rows and without
     their mean. It contains the image motion and the correlations of all parameters: a record shorter than a period
     leaves amplitude and frequency uncertain, and may still determine the displacement. None: not known.
-
-    Example:
-        >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.datasets import example_frames
-        >>> frames, timing, _ = example_frames()
-        >>> std = rsv.detect_vibration(frames, timing).std
-        >>> bool((std.frequency < 0.1).all())  # Hz
-        True
     """
 
     _MISSING = math.inf  # None in a file: an unknown standard deviation
@@ -489,8 +454,8 @@ def tone_rows(
 ) -> list[tuple[tuple[int, ...], list[str]]]:
     """Rows of a table of tones: the index (..., axis, tone) in the tensors, and the cells of the ``quantities``.
 
-    Standard deviations if a further tone is hidden are added
-    where they are larger, but for phases: a line of a terminal has 80 characters.
+    Standard deviations if a further tone is ``hidden`` are added where they are larger, but for phases: a line of a
+    terminal has 80 characters.
     """
     rows = []
     for at, labels in tone_places(vibration):
@@ -522,14 +487,11 @@ def image_motion_line(vibration: Vibration, std: VibrationStd | None = None) -> 
 
 @checks_arguments
 def blind_frequencies(timing: SensorTiming, highest: float) -> Tensor:
-    """Frequencies up to ``highest`` Hz that cannot be measured from the frames.
+    """Frequencies up to ``highest`` Hz that cannot be measured from the frames, sorted, float64.
 
     ``j / (m T_row)``: every frame is displaced alike (the gain of Eq. 7 is zero). ``j / T_e``: the exposure averages
     the tone out (the sinc of Eq. 2 is zero). With individual frame start times, only frequencies for which all frames
     are displaced alike are blind; for two frames, ``j`` over the time between them.
-
-    Returns:
-        Sorted float64 tensor.
 
     Example:
         >>> timing = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
@@ -547,5 +509,4 @@ def blind_frequencies(timing: SensorTiming, highest: float) -> Tensor:
     alike = multiples(float(intervals[0])) if len(intervals) else starts[:0]
     cycles = alike[:, None] * intervals
     alike = alike[((cycles - cycles.round()).abs() < 1e-6).all(-1)]  # whole cycles to the rounding of the start times
-    frequencies: Tensor = torch.cat([alike, multiples(timing.exposure_time)]).unique(sorted=True)
-    return frequencies
+    return torch.cat([alike, multiples(timing.exposure_time)]).unique(sorted=True)

@@ -20,10 +20,6 @@ def fast_length(minimum: int) -> int:
     """Smallest length from ``minimum`` on that is fast to transform: a multiple of 8 with prime factors up to 11.
 
     A prime length takes 4-5 times as long, and an odd one with small factors more than twice.
-
-    Example:
-        >>> [fast_length(minimum) for minimum in (1, 97, 1104, 2072)]
-        [8, 112, 1120, 2112]
     """
     return 8 * int(fft.next_fast_len(-(-minimum // 8)))
 
@@ -76,18 +72,17 @@ def _mirrored_ends(width: int, extra: int) -> Array:
 def _blend(extra: int, hold: float) -> Array:
     """Share of the right end in the extension."""
     progress = ((np.arange(1, extra + 1) / (extra + 1) - hold) / (1 - 2 * hold)).clip(0, 1)
-    share: Array = 0.5 + 0.5 * np.cos(np.pi * progress)
-    return share
+    return 0.5 + 0.5 * np.cos(np.pi * progress)
 
 
 def extend_rows(images: Tensor, length: int, hold: float = 0.25) -> Tensor:
     """Extend rows (..., W) at their right end to ``length``, so that they close smoothly into a period.
 
-    Both ends are extended by odd reflection, which keeps value and slope; a cosine blends the reflection of the last
-    pixels into that of the first ones. Without it, the jump would ring into the image, and displaced rows would wrap
-    around. ``hold`` is the share of the gap next to either end that consists of the reflection of that end only, below
-    0.5. With a quarter, rows displaced by up to a quarter of the gap contain no content of the opposite end, which
-    improves restoration near the ends by up to 0.7 dB (displacements of 40 px, exposures of 100 rows).
+    Both ends are extended by odd reflection, which keeps value and slope; a cosine blends the two reflections. Without
+    it, the jump would ring into the image, and displaced rows would wrap around. ``hold`` is the share of the gap next
+    to either end that is the reflection of that end only. With a quarter, rows displaced by up to a quarter of the gap
+    contain no content of the opposite end, which improves restoration near the ends by up to 0.7 dB (displacements of
+    40 px, exposures of 100 rows).
     """
     width = images.shape[-1]
     extra = length - width
@@ -102,10 +97,7 @@ def extend_rows(images: Tensor, length: int, hold: float = 0.25) -> Tensor:
 
 
 def extended_length(width: int, reach: int) -> int:
-    """Length for ``extend_rows`` of rows of ``width`` px that are displaced by up to ``reach`` px.
-
-    A quarter of the gap is 8 px longer than the displacement.
-    """
+    """Length for ``extend_rows`` of rows of ``width`` px: a quarter of the gap is ``reach`` and 8 px more."""
     return fast_length(width + 4 * (8 + reach))
 
 
@@ -119,25 +111,15 @@ def spline_spectra(images: Tensor, degree: int, length: int) -> Tensor:
 
 
 def shift_phases(shift: Tensor, length: int, frequencies: slice, dtype: torch.dtype) -> Tensor:
-    """Phase factors ``exp(2 pi i k shift / length)``, which move rows back by a shift, as products of two tables.
+    """Phase factors ``exp(2 pi i k shift / length)`` (..., stop - start), which move rows back by a shift (...) in px.
 
-    The shift (...) is in px; ``frequencies`` selects k of ``rfft``. The result is (..., stop - start).
-
-    Example:
-        >>> rows = torch.sin(2 * torch.pi * (torch.arange(8.0) - 0.25) / 8)
-        >>> phases = shift_phases(torch.tensor(0.25, dtype=torch.float64), 8, slice(0, 5), torch.complex64)
-        >>> moved = torch.fft.irfft(torch.fft.rfft(rows) * phases, n=8)
-        >>> torch.allclose(moved, torch.sin(2 * torch.pi * torch.arange(8.0) / 8), atol=1e-6)
-        True
+    ``frequencies`` selects k of ``rfft``. The factors are products of the two ``phase_tables``.
     """
     return phase_products(*phase_tables(shift, length, frequencies, dtype), frequencies.stop - frequencies.start)
 
 
 def phase_tables(shift: Tensor, length: int, frequencies: slice, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Phase factors at every 32nd frequency (..., n), and those of 0 ... 31 steps of the frequency (..., 32).
-
-    Arguments as in ``shift_phases``; ``phase_products`` has all frequencies.
-    """
+    """Phase factors at every 32nd frequency (..., n), and those of 0 ... 31 steps of the frequency (..., 32)."""
     coarse = np.arange(frequencies.start, frequencies.stop, _PHASE_STEP)
     steps = torch.from_numpy(np.concatenate([coarse, np.arange(_PHASE_STEP)]) / length).to(shift.device)
     turns = shift[..., None] * steps

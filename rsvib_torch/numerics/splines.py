@@ -16,12 +16,8 @@ from rsvib_torch.numerics.tables import Array, table, tensor
 def bspline_weights(fraction: Tensor, degree: int, derivative: int = 0) -> Tensor:
     """Weights of the ``degree + 1`` B-splines that are not zero at a position, or their derivatives.
 
-    The value at ``x = n + fraction`` is ``sum_k weights[k] c[n - degree // 2 + k]`` with coefficients ``c``
-    of a spline of odd degree; 1 is linear interpolation. Fractions (...) in [0, 1] have weights (..., degree + 1).
-
-    Example:
-        >>> bspline_weights(torch.tensor(0.25), 1).tolist()
-        [0.75, 0.25]
+    The value at ``x = n + fraction`` is ``sum_k weights[k] c[n - degree // 2 + k]`` with coefficients ``c`` of a spline
+    of odd degree; 1 is linear interpolation. Fractions (...) in [0, 1] have weights (..., degree + 1).
     """
     if derivative:
         lower = bspline_weights(fraction, degree - 1, derivative - 1)
@@ -40,11 +36,6 @@ def spline_taps(
 
     The first of ``count`` coefficients belongs to the knot at ``start``; times and ``spacing`` are in s. The spline is
     constant beyond its ends.
-
-    Example:
-        >>> index, factors = spline_taps(np.array([0.5]), 0.0, 1.0, 4, degree=1)
-        >>> index.tolist(), factors.tolist()
-        ([[0, 1]], [[0.5, 0.5]])
     """
     place = np.clip((times - start) / spacing, 0.0, count - degree)
     cell = np.minimum(np.floor(place), count - degree - 1.0)
@@ -160,8 +151,7 @@ def bspline_coefficients(samples: Tensor, degree: int, dim: int) -> Tensor:
 def bspline_coefficients_adjoint(values: Tensor, degree: int, dim: int) -> Tensor:
     """Adjoint (transpose) of ``bspline_coefficients``."""
     adjoint = torch.func.vjp(partial(bspline_coefficients, degree=degree, dim=dim), torch.zeros_like(values))[1]
-    spread: Tensor = adjoint(values)[0]
-    return spread
+    return adjoint(values)[0]
 
 
 def _toeplitz(kernels: Tensor, rows: int, step: int = 1) -> Tensor:
@@ -175,12 +165,8 @@ def correlated(samples: Tensor, kernels: Tensor, dim: int, step: int = 1) -> Ten
     """Correlate along an axis with several kernels, at places where these lie inside ("valid").
 
     Products with small dense matrices are faster than convolutions. Samples are real or complex, and n >= N along
-    ``dim``; kernels (Q, N) are of the same dtype. The values have a leading dimension for the kernels, and
-    ``(n - N) // step + 1`` entries along ``dim``.
-
-    Example:
-        >>> correlated(torch.arange(5.0), torch.tensor([[-1.0, 1.0], [0.5, 0.5]]), 0).tolist()
-        [[1.0, 1.0, 1.0, 1.0], [0.5, 1.5, 2.5, 3.5]]
+    ``dim``; kernels (Q, N) are of the same dtype. The values have a leading dimension for the kernels, and ``(n - N) //
+    step + 1`` entries along ``dim``.
     """
     if samples.ndim == 1:
         return correlated(samples[None], kernels, 1, step)[:, 0]
@@ -221,13 +207,7 @@ def _across(samples: Tensor, kernels: Tensor, step: int, length: int) -> Tensor:
 
 @cache
 def gauss_legendre(count: int) -> tuple[Tensor, Tensor]:
-    """Gauss-Legendre nodes (N,) within 0 ... 1, and weights that sum to 1, float64; cached, do not modify them.
-
-    Example:
-        >>> nodes, weights = gauss_legendre(2)
-        >>> round(float((weights * nodes**3).sum()), 12)
-        0.25
-    """
+    """Gauss-Legendre nodes (N,) within 0 ... 1, and weights that sum to 1, float64; cached, do not modify them."""
     from scipy.special import roots_legendre  # noqa: PLC0415 - takes 0.1 s
 
     nodes, weights = roots_legendre(count)  # 10,000 nodes in 2 s; numpy.polynomial.legendre.leggauss: minutes

@@ -26,8 +26,7 @@ def table(values: Tensor) -> Array:
         values = values.detach()
     if values.is_conj():
         values = values.resolve_conj()
-    array: Array = (values if values.device.type == "cpu" else values.cpu()).numpy()
-    return array
+    return (values if values.device.type == "cpu" else values.cpu()).numpy()
 
 
 def split_axis(values: Array, axis: int, *sizes: int) -> Array:
@@ -68,14 +67,12 @@ def quantile(values: Array, share: float, axis: int) -> Array:
     place = share * np.maximum((~np.isnan(values)).sum(axis, keepdims=True) - 1, 0)
     below = np.floor(place).astype(np.int64)
     low, high = (np.take_along_axis(ordered, index, axis) for index in (below, np.ceil(place).astype(np.int64)))
-    between: Array = (low + (high - low) * (place - below)).squeeze(axis)
-    return between
+    return (low + (high - low) * (place - below)).squeeze(axis)
 
 
 def pseudo_inverse(matrix: Array) -> Array:
     """Pseudo-inverse of matrices (..., M, N); singular values below rounding are 0."""
-    inverse: Array = np.linalg.pinv(matrix, rcond=max(matrix.shape[-2:]) * np.finfo(np.float64).eps)
-    return inverse
+    return np.linalg.pinv(matrix, rcond=max(matrix.shape[-2:]) * np.finfo(np.float64).eps)
 
 
 def tensor(values: Array) -> Tensor:

@@ -28,8 +28,7 @@ def _spline_transfer(places: Tensor, frequencies: Tensor, degree: int) -> Tensor
     taps = torch.arange(degree + 1, dtype=places.dtype, device=places.device) - degree // 2
     at_rest = samples @ waves(taps, frequencies).real if degree > 1 else torch.ones_like(frequencies)
     weights = bspline_weights(places - cell, degree)[..., None]
-    moved: Tensor = (weights * waves(cell[..., None] + taps, frequencies)).sum(-2) / at_rest
-    return moved
+    return (weights * waves(cell[..., None] + taps, frequencies)).sum(-2) / at_rest
 
 
 _TRANSFERS: dict[str, tuple[Callable[[Tensor, Tensor], Tensor], int, Quadrature]] = {
@@ -65,8 +64,7 @@ def _filters(
     prior = 4 * (torch.sin(math.pi * v).square()[:, None] + torch.sin(math.pi * u).square())
     damped = torch.addcmul(squared_modulus(transfer), weight[:, None, None], prior)
     response = transfer.conj() / damped.clamp(min=torch.finfo(u.dtype).tiny)
-    filters: Tensor = torch.fft.ifft(response, dim=-2)
-    return filters
+    return torch.fft.ifft(response, dim=-2)
 
 
 def _aligned_spectra(frames: Tensor, motion: FrameMotion, u: Tensor, length: int) -> Tensor:
@@ -80,32 +78,24 @@ def _aligned_spectra(frames: Tensor, motion: FrameMotion, u: Tensor, length: int
         lines * waves(places, -u).to(lines.dtype)[:, None]
         for lines, places in zip(spectra.split(aligned_rows), mean.flatten().split(aligned_rows), strict=True)
     ]
-    aligned: Tensor = torch.cat(moved).unflatten(0, (B * T, H))
-    return aligned
+    return torch.cat(moved).unflatten(0, (B * T, H))
 
 
-def restore_banded(
-    frames: Tensor,
-    motion: FrameMotion,
-    options: BandedOptions,
-) -> Tensor:
+def restore_banded(frames: Tensor, motion: FrameMotion, options: BandedOptions) -> Tensor:
     """Restore frames (B, T, C, H, W) slab by slab (Sec. 3.2 of Liu et al. 2023).
 
     Scene row k appears at frame row r(k). The slab of rows r(k) - l ... r(k) + l, l = ``half_rows``, is assumed to have
     the PSF of that row. It is deconvolved by the Wiener filter ``H* / (|H|^2 + w (4 sin^2 pi u + 4 sin^2 pi v))``, w =
-    ``noise_to_signal``, and its central rows are kept. Whole pixels of the displacement shift the slab, so that a low
-    slab suffices. The prior penalises image gradients, which preserves the mean. Rows are extended smoothly at their
-    ends and mirrored above and below. All pixels count: ``restore`` replaces those without data by local means, and
-    saturated ones count at their level.
+    ``noise_to_signal``, and its central rows are kept. The prior penalises image gradients, which preserves the mean.
+    Whole pixels of the displacement shift the slab. Rows are extended smoothly at their ends and mirrored above and
+    below. All pixels count: ``restore`` replaces those without data by local means.
     """
     half_rows = check_whole_number("half_rows", options.half_rows, at_least=1, at_most=max(16, frames.shape[-2]))
     stride = check_whole_number("stride", options.stride, at_least=1, at_most=max(2, frames.shape[-2]))
     interpolation, chunk_rows = options.interpolation, options.chunk_rows
     weights = _noise_to_signal(frames, options.noise_to_signal)
     B, T, C, H, W = frames.shape
-    length = extended_length(
-        W, motion.displacement_bound() + 8
-    )  # a Wiener filter extends at least 8 px beyond the displacement
+    length = extended_length(W, motion.displacement_bound() + 8)  # px by which a Wiener filter extends beyond it
     size = 2 * half_rows + 1
     u = torch.fft.rfftfreq(length, dtype=torch.float64, device=frames.device)
     v = torch.fft.fftfreq(size, dtype=torch.float64, device=frames.device)

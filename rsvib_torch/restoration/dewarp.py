@@ -57,8 +57,7 @@ def restore_dewarp(frames: Tensor, motion: FrameMotion, options: DewarpOptions =
     spectra = torch.view_as_real(spline_spectra(frames, _DEGREE, length))
 
     def rows_of(moved: Tensor) -> Tensor:
-        rows: Tensor = torch.fft.irfft(torch.view_as_complex(moved), n=length)[..., : frames.shape[-1]]
-        return rows
+        return torch.fft.irfft(torch.view_as_complex(moved), n=length)[..., : frames.shape[-1]]
 
     return _moved_back(spectra, moves, rows_of, options.chunk_rows or _CHUNK_ROWS)
 
@@ -84,8 +83,7 @@ def _moved_back(spectra: Tensor, moves: _Moves, rows_of: Callable[[Tensor], Tens
         return rows_of(torch.view_as_real(moved))
 
     parts = ((part, restored(*chunk)) for part, chunk in zip(runs(H, chunk_rows), chunks, strict=True))
-    stacked: Tensor = gathered(parts, H, 1).unflatten(0, (B, T)).movedim(3, 2)
-    return stacked
+    return gathered(parts, H, 1).unflatten(0, (B, T)).movedim(3, 2)
 
 
 class FixedDewarp(nn.Module):
@@ -103,8 +101,7 @@ class FixedDewarp(nn.Module):
         num_frames: Frames of a stack.
 
     Raises:
-        ValueError: If the vibration is a batch or has roll, zoom or a camera, or if frames of this size are refused by
-            ``restore``.
+        ValueError: If the vibration is a batch or has roll, zoom or a camera, or ``restore`` refuses this size.
 
     Example:
         >>> import rsvib_torch as rsv

@@ -26,7 +26,7 @@ from rsvib_torch.frames.prepare import PreparedFrames
 from rsvib_torch.imaging.trajectory import exposure_trajectory, rows_and_displacement
 from rsvib_torch.motion.field import ColumnMotion, largest_in_frame, largest_slope
 from rsvib_torch.motion.motion import Motion
-from rsvib_torch.motion.sampling import source_map
+from rsvib_torch.motion.sampling import places, recorded_offsets
 from rsvib_torch.motion.timing import MAX_ROWS, RowTiming, SensorTiming
 
 
@@ -50,6 +50,8 @@ class FrameMotion:
 
     def of(self, stacks: list[int], frames: list[int] | None = None) -> "FrameMotion":
         """The motion of some stacks of the batch, and of some of their frames; None for all."""
+        if frames is None and stacks == list(range(len(self.shift))):
+            return self
         members = slice(None) if frames is None else frames
         vibration = self.vibration.mapped(lambda values: values[stacks])
         shift = self.shift[stacks][:, members]
@@ -70,8 +72,7 @@ class FrameMotion:
         times = self.frame_starts[:, None] + delays
         moved = self.vibration.drift(times.expand(len(self.shift), -1, -1)).detach()
         drift = (moved - moved[:, :, 1:2]).abs().amax((1, 2))
-        bounds: list[list[float]] = (self.vibration.largest_oscillation() + drift).tolist()
-        return bounds
+        return (self.vibration.largest_oscillation() + drift).tolist()
 
     def check_fits(self, width: int) -> None:
         """Raise a ``ValueError`` if frames of so many columns, in row order, may move by more than their own size.
@@ -113,8 +114,7 @@ class FrameMotion:
     def blur_lengths(self) -> NDArray[np.float64]:
         """Largest range (B, T, 2) of the displacement along (x, y) during the exposure of a row, in px."""
         low, high = self.exposures[0].detach().aminmax(dim=-2)
-        lengths: NDArray[np.float64] = (high - low).amax(2).cpu().numpy()
-        return lengths
+        return (high - low).amax(2).cpu().numpy()
 
 
 def frame_motion(vibration: Motion, timing: RowTiming, frames: int | Tensor, num_rows: int) -> FrameMotion:
@@ -192,8 +192,9 @@ def visible_pixels(
         of_frames.check_fits(columns)
         for frame in range(num_frames):
             # the place in the frame where each pixel of the restored frame was recorded
-            places = source_map(motion, timing, (height, width), frame, shift[frame], np.float64)
-            masks.append(((places >= 0) & (places <= limits)).all(0))
+            offsets, weights = recorded_offsets(motion, timing, (height, width), frame, shift[frame])
+            recorded = places(offsets, weights, timing, (height, width), np.float64)
+            masks.append(((recorded >= 0) & (recorded <= limits)).all(0))
         shifts.append(shift)
     mask = torch.from_numpy(np.stack(masks)).to(vibration.device)
     return mask.view(*batch, num_frames, height, width), torch.stack(shifts).view(*batch, num_frames, 2)

@@ -42,12 +42,12 @@ def _tapered(squares: Tensor) -> Tensor:
     return (squares - squares.mean((-2, -1), keepdim=True)) * window * window[:, None]
 
 
-def _mostly_measured(missing: Tensor, dims: tuple[int, ...], *, max_missing: float = 0.1) -> Tensor:
+def _mostly_measured(missing: Tensor, dims: tuple[int, ...]) -> Tensor:
     """Parts of images that count, by the share of their pixels that is missing.
 
-    A part counts up to ``max_missing``; if all parts of an image along ``dims`` miss more, those that miss least count.
+    A part counts up to a tenth; if all parts of an image along ``dims`` miss more, those that miss least count.
     """
-    return (missing <= missing.amin(dims, keepdim=True).clamp(min=max_missing)) & (missing < 1)
+    return (missing <= missing.amin(dims, keepdim=True).clamp(min=0.1)) & (missing < 1)
 
 
 # Single images: the quietest blocks of a high-pass residual
@@ -113,14 +113,12 @@ def noise_deviation(frames: Tensor, ignore: Tensor | None) -> Array:
     variance = min(2.0 * math.prod(_correlation_area(difference) for difference in orders) / (9.0 * block**2), 0.2)
     expected = (1.0 - variance + NormalDist().inv_cdf(share) * variance**0.5) ** 3
     few = (~np.isnan(powers)).sum(-1) < 8  # too few blocks for a quantile
-    deviation: Array = np.sqrt(np.where(few, valid_mean(powers, -1), quantile(powers, share, -1) / expected))
-    return deviation
+    return np.sqrt(np.where(few, valid_mean(powers, -1), quantile(powers, share, -1) / expected))
 
 
 def _differences(count: int, order: int) -> Array:
     """Matrix (count, count + order) of differences of neighbours."""
-    matrix: Array = np.diff(np.eye(count + order), order, axis=0)
-    return matrix
+    return np.diff(np.eye(count + order), order, axis=0)
 
 
 def _correlation_area(order: int) -> float:
@@ -132,18 +130,17 @@ def _correlation_area(order: int) -> float:
 # Two frames: the residual after the scene that explains both best is subtracted
 
 _MIN_SIDE = 64  # px that two frames must share along each axis, or the whole frame if it is smaller
+_MAX_MISSING = 0.1  # share of the compared pixels
 
 
 @torch.no_grad()
-def noise_of_frame_pair(
-    frames: Tensor, motion: FrameMotion, ignore: Tensor | None, high_pass: Tensor, *, max_missing: float = 0.1
-) -> Tensor:
+def noise_of_frame_pair(frames: Tensor, motion: FrameMotion, ignore: Tensor | None, high_pass: Tensor) -> Tensor:
     """Noise power (B, T) of each frame from the two middle ones of its stack that have content.
 
     The least-squares scene of both frames leaves a residual without texture. What texture adds to ``high_pass`` is
     measured as the difference between that estimate and the residual, and assumed equal in all frames. NaN for stacks
-    in which fewer than two frames have content, or miss more than ``max_missing`` of the compared pixels. Other
-    arguments as above ``ESTIMATORS``.
+    in which fewer than two frames have content, or too many of the compared pixels are missing. Arguments as above
+    ``ESTIMATORS``.
     """
     result = torch.full_like(high_pass, math.nan)
     size = frames.shape[-2], frames.shape[-1]
@@ -165,9 +162,7 @@ def noise_of_frame_pair(
     if min(common) < least:
         for stack in pairs:
             missing = None if ignore is None else ignore[[stack]]
-            result[[stack]] = noise_of_frame_pair(
-                frames[[stack]], motion.of([stack]), missing, high_pass[[stack]], max_missing=max_missing
-            )
+            result[[stack]] = noise_of_frame_pair(frames[[stack]], motion.of([stack]), missing, high_pass[[stack]])
         return result
     num_rows, columns = min(common[0], 256), common[1]  # from the middle: more rows hardly lower the variance
     stacks = list(pairs)
@@ -177,12 +172,8 @@ def noise_of_frame_pair(
     tops, lefts = firsts[..., 0] + ((size[0] - abs(steps[:, :1])) - num_rows) // 2, firsts[..., 1]
 
     def shared(values: Tensor) -> Tensor:
-        parts = [
-            cut_parts(
-                values[stacks, members[:, k].tolist()], tops[:, k].tolist(), lefts[:, k].tolist(), (num_rows, columns)
-            )
-            for k in (0, 1)
-        ]
+        places = zip(members.T.tolist(), tops.T.tolist(), lefts.T.tolist(), strict=True)
+        parts = [cut_parts(values[stacks, frame], top, left, (num_rows, columns)) for frame, top, left in places]
         return torch.stack(parts, 1)
 
     images, ignored = shared(frames), None if ignore is None else shared(ignore)
@@ -190,8 +181,7 @@ def noise_of_frame_pair(
     if ignored is not None:
         measured_share = 1.0 - ignored.any(1).to(images.dtype).mean((1, 2, 3))
     # noise of both frames, and texture that the high-pass estimate counts as noise
-    place = (torch.as_tensor(values, device=frames.device) for values in (stacks, members, tops))
-    stack_of, member_of, top_of = place
+    stack_of, member_of, top_of = (torch.as_tensor(values, device=frames.device) for values in (stacks, members, tops))
     rows = top_of[..., None] + torch.arange(num_rows, device=frames.device)
     displacement, node_weights = motion.exposures
     moved = displacement[stack_of[:, None, None], member_of[..., None], rows]
@@ -203,35 +193,27 @@ def noise_of_frame_pair(
     known_power, noise = high_pass[stacks], noise[:, None]
     upper = 2.0 * noise + (known_power - alone.amax(1, keepdim=True)).clamp(min=0.0)
     estimate = torch.maximum(known_power - texture, 0.5 * torch.minimum(known_power, noise)).minimum(upper)
-    too_few = (measured_share < 1.0 - max_missing)[:, None]
+    too_few = (measured_share < 1.0 - _MAX_MISSING)[:, None]
     result[stacks] = estimate.masked_fill(too_few, math.nan)
     return result
 
 
-def _residual_power(
-    images: Tensor,
-    displacement: Tensor,
-    node_weights: Tensor,
-    *,
-    num_frequencies: int = 24,
-    prior_weight: float = 1e-4,
-) -> Tensor:
+def _residual_power(images: Tensor, displacement: Tensor, node_weights: Tensor) -> Tensor:
     """Residual power (S,) per degree of freedom of pairs of images (S, 2, C, R, W) minus their least-squares scene.
 
-    Only ``num_frequencies`` horizontal frequencies of the upper half are used, where scenes are weakest. A smoothness
-    prior of ``prior_weight``, relative to the data, fills in rows of the scene that neither frame contains.
-    ``displacement`` (S, 2, R, N, 2) is that of the rows during their exposures, in the coordinates of the scene.
+    Only 24 horizontal frequencies of the upper half are used, where scenes are weakest. A weak smoothness prior fills
+    in rows of the scene that neither frame contains. ``displacement`` (S, 2, R, N, 2) is that of the rows during their
+    exposures, in the coordinates of the scene.
     """
     num_rows, width = images.shape[-2:]
     moved = displacement.flatten(0, 1)
     kernels = RowKernels.of_rows(moved, node_weights, moved.new_ones(len(moved)), num_rows, 4 * _MIN_SIDE)
-    count = min(num_frequencies, width // 4)
+    count = min(24, width // 4)
     chosen = np.linspace(width // 4, width // 2, count, dtype=np.float32).astype(np.int64)
     sample = sample_rows(images, kernels, chosen)
-    # correlation 0.9 of neighbouring rows of the scene
-    products = torch.zeros(1, 2, 2, len(images), count, dtype=torch.float64, device=images.device)
-    products[0, 0, 0], products[0, 0, 1], products[0, 1, 0] = prior_weight, 0.9**2 * prior_weight, -0.9 * prior_weight
-    explained = sample.explain(products)
+    # correlation 0.9 of neighbouring rows of the scene, of weight 1e-4 beside the data
+    products = torch.tensor([[1.0, 0.9**2], [-0.9, 0.0]], dtype=torch.float64, device=images.device)
+    explained = sample.explain(1e-4 * products[None, :, :, None, None].expand(-1, -1, -1, len(images), count))
     freedom = explained.count * count - explained.freedom[0].sum(-1)
     return torch.as_tensor(explained.power[0].sum(-1) / freedom, dtype=images.dtype, device=images.device)
 
@@ -244,39 +226,30 @@ _SECTORS = 6  # directions, with one power law each
 def _pooled(values: Tensor) -> Tensor:
     """Mean over 2 x 2 neighbouring frequencies of (..., U, V), without the lowest and the highest u."""
     inner = values[..., 1 : (values.shape[-2] - 2) // 2 * 2 + 1, :]
-    pooled: Tensor = inner.unflatten(-2, (-1, 2)).unflatten(-1, (-1, 2)).mean((-3, -1))
-    return pooled
+    return inner.unflatten(-2, (-1, 2)).unflatten(-1, (-1, 2)).mean((-3, -1))
 
 
-def noise_of_spectral_floor(
-    frames: Tensor,
-    motion: FrameMotion,
-    ignore: Tensor | None,
-    high_pass: Tensor,
-    *,
-    max_reduction: float = 9.0,
-    min_reduction: float = 1.25,
-) -> Tensor:
+def noise_of_spectral_floor(frames: Tensor, motion: FrameMotion, ignore: Tensor | None, high_pass: Tensor) -> Tensor:
     """Noise power (B, T) of each frame from ``noise_floor``; NaN if it is not clearly lower than ``high_pass``.
 
-    ``max_reduction`` is the largest factor between ``high_pass`` and the result; a noise level that is far too low
-    amplifies noise more than one that is too high blurs. Below ``min_reduction``, ``high_pass`` is kept, because the
-    floor is the less accurate of the two. Other arguments as above ``ESTIMATORS``.
+    Arguments as above ``ESTIMATORS``.
     """
     floor = noise_floor(frames, ignore).mean(-1).to(high_pass.dtype)
-    bounded = torch.maximum(floor, high_pass / max_reduction)
-    return torch.where(floor < high_pass / min_reduction, bounded, math.nan)
+    # a noise level that is far too low amplifies noise more than one that is too high blurs
+    bounded = torch.maximum(floor, high_pass / 9.0)
+    # of two values that differ by less, the floor is the less accurate one
+    return torch.where(floor < high_pass / 1.25, bounded, math.nan)
 
 
 @torch.no_grad()
-def noise_floor(frames: Tensor, ignore: Tensor | None = None, *, min_frequency: float = 0.2) -> Tensor:
+def noise_floor(frames: Tensor, ignore: Tensor | None = None) -> Tensor:
     """Power (...) of the white noise below the texture of each image (..., H, W), from its power spectrum.
 
     At frequency f in direction d the power is ``n + c_d f^(-a_d) exp(-b f^2)``: a power law for the scene in every
     direction, Gaussian optics, and one floor. Fisher scoring estimates all of them, for powers with exponential
     distributions about their means (Whittle 1953). The floor is uncertain if texture exceeds it up to the highest
-    frequencies. Below ``min_frequency`` cycles per px, spectra are steeper than the power law. Squares with many pixels
-    to ``ignore`` do not count. NaN for an image of less than one square, or without a usable one.
+    frequencies. Squares with many pixels to ``ignore`` do not count. NaN for an image of less than one square, or
+    without a usable one.
     """
     height, width = frames.shape[-2:]
     images = frames.reshape(-1, height, width)
@@ -286,14 +259,14 @@ def noise_floor(frames: Tensor, ignore: Tensor | None = None, *, min_frequency: 
     u = _pooled(torch.fft.rfftfreq(_SIDE, dtype=torch.float64, device=frames.device)[:, None].expand(-1, 2))
     v = torch.fft.fftfreq(_SIDE, dtype=torch.float64, device=frames.device).unflatten(0, (-1, 2)).mean(-1)
     frequency, direction = torch.hypot(u, v), torch.atan2(v, u)
-    used = frequency > min_frequency
+    used = frequency > 0.2  # cycles per px; spectra are steeper than the power law below
     sector = ((direction[used] / math.pi + 0.5) * _SECTORS).long().clamp(0, _SECTORS - 1)
     return _fit_floor(power[:, used], frequency[used], sector).reshape(frames.shape[:-2])
 
 
-def _spectrum(images: Tensor, ignore: Tensor | None, *, squares_per_axis: int = 6) -> Tensor:
+def _spectrum(images: Tensor, ignore: Tensor | None) -> Tensor:
     """Mean power (N, V, U) of squares of images (N, H, W); the power of white noise is its variance."""
-    counts = [min(2 * extent // _SIDE - 1, squares_per_axis) for extent in images.shape[-2:]]
+    counts = [min(2 * extent // _SIDE - 1, 6) for extent in images.shape[-2:]]
     squares = _tapered(_cut_squares(images, counts).flatten(1, 2))
     power = squared_modulus(torch.fft.rfft2(squares)).to(torch.float64)
     if ignore is None:
@@ -303,20 +276,11 @@ def _spectrum(images: Tensor, ignore: Tensor | None, *, squares_per_axis: int = 
     return (power * usable[..., None, None]).sum(1) / usable.sum(1)[:, None, None]
 
 
-def _fit_floor(
-    power: Tensor,
-    frequency: Tensor,
-    sector: Tensor,
-    *,
-    steepness_mean: float = 3.0,
-    steepness_std: float = 8.0,
-    iterations: int = 16,
-    max_step: float = 0.7,
-) -> Tensor:
+def _fit_floor(power: Tensor, frequency: Tensor, sector: Tensor) -> Tensor:
     """Floor (N,) of powers (N, K) by Fisher scoring of ``n + c_d f^(-a_d) exp(-b f^2)`` in the logarithms of n and c.
 
     The frequencies f (K,) are in cycles per px, ``sector`` (K,) is the direction d, and the exponents a have a weak
-    prior. ``max_step`` is the largest change of a parameter in one step.
+    prior, 3 with a standard deviation of 8.
     """
     # start from half of the lowest power as floor, and from half of the mean power of each sector as scene
     inside = torch.nn.functional.one_hot(sector, _SECTORS).to(torch.float64)  # (K, D)
@@ -327,10 +291,10 @@ def _fit_floor(
     typical = ((power @ inside) / inside.sum(0)).clamp(min=1e-9)
     log_level, exponent = (0.5 * typical).log(), torch.full_like(typical, 2.0)
     parameters = torch.cat([(0.5 * low).log(), torch.zeros_like(low), log_level, exponent], dim=-1)
-    expected = parameters.new_tensor([0.0] * (2 + _SECTORS) + [steepness_mean] * _SECTORS)
-    prior = parameters.new_tensor([1e-3] * (2 + _SECTORS) + [steepness_std**-2] * _SECTORS)
+    expected = parameters.new_tensor([0.0] * (2 + _SECTORS) + [3.0] * _SECTORS)
+    prior = parameters.new_tensor([1e-3] * (2 + _SECTORS) + [8.0**-2] * _SECTORS)
     log_frequency, square = frequency.log(), frequency.square()
-    for _ in range(iterations):
+    for _ in range(16):
         # expected power, and the derivatives of its logarithm
         floor, blur, log_level, exponent = parameters.split([1, 1, _SECTORS, _SECTORS], dim=-1)
         scene = (log_level[:, sector] - exponent[:, sector] * log_frequency - blur * square).exp()
@@ -345,7 +309,7 @@ def _fit_floor(
         normal = slope.transpose(-2, -1) @ slope + torch.diag(prior)
         gradient = (slope.transpose(-2, -1) @ (power / model - 1.0)[..., None])[..., 0]
         gradient[:, 1:] += ((expected - parameters) * prior)[:, 1:]
-        parameters = parameters + torch.linalg.solve(normal, gradient).clamp(-max_step, max_step)
+        parameters = parameters + torch.linalg.solve(normal, gradient).clamp(-0.7, 0.7)
         parameters[:, 1].clamp_(min=0.0)  # optics attenuate
     return parameters[:, 0].exp() * scale[:, 0]
 
@@ -366,20 +330,17 @@ def _fit_floor(
 # It must not change its arguments, must not raise for small, constant or masked frames, and a stack must not affect
 # another one.
 Estimator = Callable[[Tensor, FrameMotion, Tensor | None, Tensor], Tensor]
-ESTIMATORS: dict[str, Estimator] = {
-    "frame pair": noise_of_frame_pair,
-    "spectral floor": noise_of_spectral_floor,
-}
+ESTIMATORS: dict[str, Estimator] = {"frame pair": noise_of_frame_pair, "spectral floor": noise_of_spectral_floor}
 
 
 @torch.no_grad()
 def noise_levels(frames: Tensor, motion: FrameMotion, ignore: Tensor | None = None) -> Tensor:
     """Standard deviation (B, T) of the noise of each frame of B stacks, in its unit; 0 without any content.
 
-    ``estimate_noise`` counts fine texture as noise, which makes it an upper bound. The first estimator of
-    ``ESTIMATORS`` that applies to a stack lowers it. A frame without content, or with too few measured pixels, is
-    assigned the median noise power of the others of its stack. The frames (B, T, C, H, W) are in row order, with local
-    means at pixels to ``ignore``.
+    ``estimate_noise`` counts fine texture as noise, which makes it an upper bound; the first estimator of
+    ``ESTIMATORS`` that applies to a stack lowers it. A frame without content, or with too few measured pixels, has the
+    median noise power of the others. The frames (B, T, C, H, W) are in row order, with local means at pixels to
+    ``ignore``.
     """
     alone = valid_mean(np.square(noise_deviation(frames, ignore)), -1)
     alone[_constant(frames)] = math.nan
@@ -397,8 +358,7 @@ def noise_levels(frames: Tensor, motion: FrameMotion, ignore: Tensor | None = No
     return torch.as_tensor(np.sqrt(power), dtype=frames.dtype, device=frames.device)
 
 
-def _constant(frames: Tensor, row_step: int = 8, tolerance: float = 1e-6) -> NDArray[np.bool_]:
+def _constant(frames: Tensor) -> NDArray[np.bool_]:
     """Frames (B, T) whose values, in every eighth row, are equal to within rounding: they hold not even noise."""
-    low, high = tables(*frames[..., ::row_step, :].flatten(2).aminmax(dim=-1))
-    constant: NDArray[np.bool_] = high - low <= tolerance * np.maximum(-low, high)
-    return constant
+    low, high = tables(*frames[..., ::8, :].flatten(2).aminmax(dim=-1))
+    return high - low <= 1e-6 * np.maximum(-low, high)

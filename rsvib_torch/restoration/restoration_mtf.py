@@ -70,8 +70,7 @@ def _waves_at_rest(frequency: Tensor, places: Tensor) -> Tensor:
     """Waves (N, F) at places (N,) in px, complex; phases that grow with the square avoid a peak of their sums."""
     number = torch.arange(len(frequency), dtype=torch.float64, device=places.device)
     phases = waves(number.square() / len(frequency), number.new_tensor([0.5]))[:, 0]
-    result: Tensor = (2 / len(frequency)) ** 0.5 * waves(places, -frequency) * phases
-    return result
+    return (2 / len(frequency)) ** 0.5 * waves(places, -frequency) * phases
 
 
 def _probes(motion: FrameMotion, frequency: Tensor, size: tuple[int, int]) -> Tensor:

@@ -124,8 +124,7 @@ def restore(
 
     Returns:
         Restored frames of the same shape and floating-point dtype (float32 with full scale 1 for integer frames); with
-        ``joint=True`` the time axis has length 1. With ``scale=2`` they have twice the rows and columns: point
-        (2 i, 2 j) lies at pixel (i, j).
+        ``joint=True`` the time axis has length 1. With ``scale=2``, point (2 i, 2 j) lies at pixel (i, j).
 
     Raises:
         TypeError: If an argument has the wrong type or the method does not know an option.
@@ -138,12 +137,9 @@ def restore(
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.datasets import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
-        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
-        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
-        >>> detection = rsv.detect_vibration(frames, timing)
-        >>> restored = rsv.restore(frames, timing, detection)
+        >>> from rsvib_torch.datasets import city_and_fields, example_frames
+        >>> frames, timing, _ = example_frames()
+        >>> restored = rsv.restore(frames, timing, rsv.detect_vibration(frames, timing))
         >>> still = city_and_fields(320, 240, seed=3)[18:-18, 19:-19]  # the scene, cut to the size of the frames
         >>> for name, images in (("taken", frames), ("restored", restored)):
         ...     print(name, rsv.psnr(images, still, 1.0, rim=16).round(decimals=0).tolist(), "dB")
@@ -188,10 +184,7 @@ def restore(
 @outside_graphs
 @full_precision
 def restore_prepared(frames: PreparedFrames, vibration: Motion, options: RestorationOptions) -> Tensor:
-    """``restore`` of prepared frames, without a check of motion and result, and without sharpening by ``optics``.
-
-    The motion is in image axes, the result (B, T, C, H, W) in row order.
-    """
+    """``restore`` of prepared frames by a motion in image axes, (B, T, C, H, W) in row order, without any checks."""
     return _restored(frames, motion_of_frames(frames, vibration), options)
 
 
@@ -215,9 +208,8 @@ def restore_each(
 ) -> tuple[Tensor, Vibration, tuple[Reason, ...]]:
     """Restore each frame with its own vibration.
 
-    Returns:
-        Frames (B, T, C, H, W) in row order, as taken where no motion is known; the B T vibrations that were undone,
-        each with the time origin in the middle of its frame; a reason for each axis that was restored in no frame.
+    The results are frames (B, T, C, H, W) in row order, as taken where no motion is known; the B T vibrations that were
+    undone, each with the time origin in the middle of its frame; a reason for each axis that was restored in no frame.
     """
     (stacks, count), height = frames.images.shape[:2], frames.images.shape[-2]
     if tuple(followed.batch_shape) != ((stacks, count) if frames.batched else (count,)):
@@ -303,14 +295,12 @@ class VibrationRestorer(TimedModule):
         timing: The sensor.
 
     Example:
-        >>> import torch
         >>> import rsvib_torch as rsv
         >>> from rsvib_torch.datasets import example_frames
         >>> frames, timing, vibration = example_frames()
         >>> restorer = rsv.VibrationRestorer(timing, method="dewarp", check=False)
-        >>> model = torch.nn.Conv2d(1, 4, 3)  # any network
         >>> batch = frames[None, :, None].requires_grad_()  # (B, T, C, H, W)
-        >>> model(restorer(batch, vibration).flatten(0, 1)).square().mean().backward()
+        >>> torch.nn.Conv2d(1, 4, 3)(restorer(batch, vibration).flatten(0, 1)).square().mean().backward()
         >>> batch.grad.shape
         torch.Size([1, 2, 1, 284, 202])
     """

@@ -17,19 +17,15 @@ from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
 
 
 def restore_richardson_lucy(
-    frames: Tensor,
-    motion: FrameMotion,
-    options: RichardsonLucyOptions,
-    *,
-    ignore: Tensor | None = None,
+    frames: Tensor, motion: FrameMotion, options: RichardsonLucyOptions, *, ignore: Tensor | None = None
 ) -> Tensor:
     """Restore frames by Richardson-Lucy iterations on the row-varying blur; negative values count as 0.
 
     ``c <- c K^T(m g / K c) / K^T m`` increases the likelihood of the scene for Poisson counts g of the measured pixels
-    m (Richardson 1972; Lucy 1974). The unknowns c are cubic B-spline coefficients of the scene: B-splines are positive,
-    hence the scene is non-negative, and they do not add the blur of linear interpolation. Every step preserves the
-    total intensity. The initial scene is the result of ``restore_dewarp``; fewer iterations amplify less noise. For
-    several frames of one scene, ``sum K^T(m g / K c) / sum K^T m`` is used, and their mean is the initial scene.
+    m (Richardson 1972; Lucy 1974), and preserves the total intensity. The unknowns c are cubic B-spline coefficients:
+    B-splines are positive, hence the scene is non-negative, and they do not add the blur of linear interpolation. The
+    initial scene is the result of ``restore_dewarp``; fewer iterations amplify less noise. For several frames of one
+    scene, ``sum K^T(m g / K c) / sum K^T m`` is used, and their mean is the initial scene.
     """
     iterations = options.iterations
     B, T, _, _, W = frames.shape
@@ -50,13 +46,10 @@ def restore_richardson_lucy(
             first = psf.first_tap[stack, members] - shift[stack, reference]
             kernels = RowPSF(first[:, None], weights[stack, members], 1)
             elsewhere = torch.tensor([member != reference for member in members], device=frames.device)
-            beyond = elsewhere[:, None, None, None] & _depends_on_boundary(kernels, W)
-            start = _mean_of_overlap(
-                dewarped[stack, members], (shift[stack, members] - shift[stack, reference]).tolist()
-            )
-            restored.append(
-                _iterate(counts[stack, members], measured[stack, members] * ~beyond, start, kernels, iterations)
-            )
+            used = measured[stack, members] * ~(elsewhere[:, None, None, None] & _depends_on_boundary(kernels, W))
+            apart = (shift[stack, members] - shift[stack, reference]).tolist()
+            start = _mean_of_overlap(dewarped[stack, members], apart)
+            restored.append(_iterate(counts[stack, members], used, start, kernels, iterations))
     return _at_pixels(torch.cat(restored).unflatten(0, (B, len(groups))))
 
 

@@ -65,8 +65,7 @@ def test_scene_too_small():
     ],
 )
 def test_bad_input(scene, options, error, message):
-    with pytest.raises(error, match=message):
-        simulate_frames(scene, TIMING, **{"vibration": Vibration(1.0, 50.0), **options})
+    refuses(lambda: simulate_frames(scene, TIMING, **{"vibration": Vibration(1.0, 50.0), **options}), message, error)
 
 
 def test_read_and_shot_noise_have_their_variance():

@@ -61,8 +61,7 @@ def changed(place, time):
 )
 def test_errors_name_the_problem(tmp_path, clock, values, options, message):
     path = write(tmp_path / "a.csv", (clock, values, values))
-    with pytest.raises(ValueError, match=message):
-        read_motion(path, **{"unit": "px", **options})
+    refuses(lambda: read_motion(path, **{"unit": "px", **options}), message)
 
 
 def test_files_that_cannot_be_read(tmp_path):

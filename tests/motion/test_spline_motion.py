@@ -73,8 +73,7 @@ def test_simulated_frames_equal_those_of_the_independent_simulator():
     ],
 )
 def test_bad_values(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        FreeMotion(*arguments)
+    refuses(lambda: FreeMotion(*arguments), message)
 
 
 def test_bad_samples():

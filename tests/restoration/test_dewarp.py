@@ -1,27 +1,22 @@
+"""Method ``"dewarp"``, and ``FixedDewarp``: the same result, as a graph without breaks and in ONNX."""
+
 from functools import partial
 
 import numpy as np
 import pytest
 import torch
+from refusals import refuses
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
-from rsvib_torch import SensorTiming
-from rsvib_torch.restoration import restore
+import rsvib_torch as rsv
 
-dewarp = partial(restore, method="dewarp")
-TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
-
-
-@pytest.fixture(scope="module")
-def short():
-    motion = Motion()
-    scene = draw_scene(336, 288, seed=14, blur=1.0)
-    frames = torch.from_numpy(take_frames(scene, TIMING, motion, 2))
-    return crop(scene), frames, motion
+TIMING = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
+dewarp = partial(rsv.restore, method="dewarp")
 
 
-def test_distortion_is_removed(short):
-    truth, frames, motion = short
+def test_distortion_is_removed():
+    motion, scene = Motion(), draw_scene(336, 288, seed=14, blur=1.0)
+    truth, frames = crop(scene), torch.from_numpy(take_frames(scene, TIMING, motion, 2))
     for frame, restored in zip(frames, dewarp(frames, TIMING, motion.vibration()), strict=True):
         assert decibel(restored, truth) > decibel(frame, truth) + 25
     half = dewarp(frames, TIMING, motion.scaled(0.5).vibration())
@@ -29,7 +24,7 @@ def test_distortion_is_removed(short):
 
 
 def test_sinusoids_are_interpolated_exactly():
-    timing = SensorTiming(row_time=20.52e-6, exposure_rows=1, frame_rows=2048)
+    timing = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=1, frame_rows=2048)
     motion = Motion(phase=(0.2, 2.0))
     rows, columns = np.arange(300.0)[:, None], np.arange(200.0)
     x, y = motion.displacement((rows[:, 0] + 0.5) * timing.row_time).T
@@ -41,3 +36,74 @@ def test_sinusoids_are_interpolated_exactly():
     restored = dewarp(frame[None], timing, motion.vibration())[0].numpy()
     assert abs(restored - scene(rows, columns))[16:-16, 24:-24].max() < 2e-3
     assert abs(frame.numpy() - scene(rows, columns))[16:-16, 24:-24].max() > 1
+
+
+VIBRATION = rsv.Vibration([2.1, 1.6], [110.0, 90.0], [0.5, 1.0], image_motion=(40.0, 20.0))
+
+
+def recording(**layout):
+    """Timing, two colour frames (2, 3, 72, 90), the module for them and the result that it must have."""
+    timing = rsv.SensorTiming(row_time=1e-4, exposure_rows=10, frame_rows=120, **layout)
+    scene = torch.from_numpy(draw_scene(120, 140, seed=3)).float().expand(3, -1, -1)
+    frames = rsv.simulate_frames(scene, timing, VIBRATION, num_frames=2, frame_size=(72, 90))
+    fixed = rsv.FixedDewarp(timing, VIBRATION, (72, 90), num_frames=2)
+    return timing, frames, fixed, dewarp(frames, timing, VIBRATION, check=False)
+
+
+@pytest.mark.parametrize("layout", [{}, {"scan_axis": -1}, {"readout_direction": "reverse"}])
+def test_result_is_that_of_restore(layout):
+    timing, frames, fixed, expected = recording(**layout)
+    for stack in (frames, frames[:, 0], torch.stack([frames, frames.flip(-1)])):
+        restored = dewarp(stack, timing, VIBRATION, check=False)
+        torch.testing.assert_close(fixed(stack), restored, atol=5e-6, rtol=0)
+    assert (expected - frames).abs().max() > 0.05
+
+
+def test_graph_has_no_break():
+    _, frames, fixed, expected = recording()
+    compiled = torch.compile(fixed, fullgraph=True, backend="eager")
+    torch.testing.assert_close(compiled(frames), expected, atol=5e-6, rtol=0)
+
+
+@pytest.mark.filterwarnings("ignore:`isinstance:FutureWarning")  # of PyTorch, within its exporter
+def test_onnx_and_exported_program_give_the_same_result(tmp_path):
+    onnxruntime = pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnxscript")
+    _, frames, fixed, expected = recording()
+    program = torch.export.export(fixed, (frames,))
+    torch.testing.assert_close(program.module()(frames), expected, atol=5e-6, rtol=0)
+    torch.onnx.export(program, (), tmp_path / "dewarp.onnx", verbose=False)
+    session = onnxruntime.InferenceSession(tmp_path / "dewarp.onnx")
+    (restored,) = session.run(None, {session.get_inputs()[0].name: frames.numpy()})
+    np.testing.assert_allclose(restored, expected, atol=1e-5)
+
+
+def test_gradient_reaches_the_frames():
+    _, frames, fixed, _ = recording()
+    weights = torch.rand(frames.shape, generator=torch.Generator().manual_seed(1))
+    given = frames.clone().requires_grad_()
+    (fixed(given) * weights).sum().backward()
+    change = torch.rand(frames.shape, generator=torch.Generator().manual_seed(2))
+    along = ((fixed(frames + change) - fixed(frames)).double() * weights).sum()  # the module is linear
+    assert float((given.grad.double() * change).sum()) == pytest.approx(float(along), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"vibration": VIBRATION.expanded(2)}, "vibration is a batch"),
+        ({"vibration": rsv.Vibration([1.0, 1.0, 1e-3], [50.0] * 3)}, "roll, zoom or a camera"),
+        ({"size": (500, 90)}, "500"),
+        ({"vibration": rsv.Vibration(500.0, 50.0)}, "more than its size"),
+    ],
+)
+def test_arguments_that_restore_refuses_are_refused(change, message):
+    timing, *_ = recording()
+    arguments = {"timing": timing, "vibration": VIBRATION, "size": (72, 90), "num_frames": 2} | change
+    refuses(lambda: rsv.FixedDewarp(**arguments), message)
+
+
+def test_frames_of_another_size_are_refused():
+    _, frames, fixed, _ = recording()
+    refuses(lambda: fixed(frames[:1]), r"frames must be stacks of .* = \(2, 72, 90\)")
+    refuses(lambda: fixed(frames.double()), r"frames must be torch\.float32", TypeError)

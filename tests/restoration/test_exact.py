@@ -124,7 +124,7 @@ def test_results_do_not_depend_on_segments(short, joint):
     torch.testing.assert_close(split, whole, rtol=0, atol=2e-5)
     gradients = [torch.autograd.grad(image[..., 150:, :].square().sum(), frames)[0] for image in (whole, split)]
     torch.testing.assert_close(gradients[1], gradients[0], rtol=0, atol=2e-4)
-    with torch.no_grad():  # in memory that is reused
+    with torch.no_grad():
         for chunk in (None, 7, 1000):
             again = restore(
                 frames, TIMING, motion.vibration(), segments=3, chunk_frequencies=chunk, check=False, joint=joint

@@ -19,6 +19,7 @@ from finer_truth import (
     still_image,
     taken,
 )
+from refusals import refuses
 from truth import decibel, draw_scene
 
 import rsvib_torch as rsv
@@ -230,5 +231,4 @@ def test_still_stacks_in_windows(tmp_path):
     ],
 )
 def test_frames_that_are_no_mosaic_are_refused(frames, change, message):
-    with pytest.raises(ValueError, match=message):
-        rsv.restore(change(frames), TIMING, VIBRATION, mosaic="RGGB")
+    refuses(lambda: rsv.restore(change(frames), TIMING, VIBRATION, mosaic="RGGB"), message)

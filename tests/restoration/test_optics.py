@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from finer_truth import FINER, TIMING, VIBRATION, after_optics, closed, noisy, still_image, taken
+from refusals import refuses
 from truth import decibel, draw_scene
 
 import rsvib_torch as rsv
@@ -80,5 +81,4 @@ def test_mtf_beyond_a_still_camera(scene, frames):
     ],
 )
 def test_errors(frames, optics, options, message):
-    with pytest.raises((ValueError, TypeError), match=message):
-        rsv.restore(frames, TIMING, VIBRATION, optics=optics, **options)
+    refuses(lambda: rsv.restore(frames, TIMING, VIBRATION, optics=optics, **options), message, (ValueError, TypeError))

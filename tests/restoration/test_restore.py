@@ -257,8 +257,7 @@ def test_saturated_pixels_do_not_lower_the_noise_level():
 )
 def test_bad_input(change, error, message):
     arguments = {"frames": torch.rand(2, 16, 16), "timing": TIMING, "vibration": Vibration(1.0, 50.0)}
-    with pytest.raises(error, match=message):
-        restore(**{**arguments, **change})
+    refuses(lambda: restore(**{**arguments, **change}), message, error)
 
 
 INVARIANT: dict[str, tuple[dict, dict]] = {  # options of every method, and one that must not change the result

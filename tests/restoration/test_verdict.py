@@ -8,6 +8,7 @@ import pytest
 import torch
 from detections import detection_of
 from field_truth import FieldMotion, take_field_frames
+from refusals import refuses
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration
@@ -296,8 +297,7 @@ def test_image_motion_that_does_not_exist_causes_a_warning(scene, wrong_motion):
 def test_invalid_arguments_are_named(change, error, message):
     arguments = {"frames": torch.rand(2, 96, 96), "restored": torch.rand(2, 96, 96)}
     arguments |= {"timing": camera(), "vibration": Vibration(1.0, 50.0)}
-    with pytest.raises(error, match=message):
-        judge_restoration(**{**arguments, **change})
+    refuses(lambda: judge_restoration(**{**arguments, **change}), message, error)
 
 
 def outcome(before, after, gain=5.0, *, resolution=(0.01, 0.01), moves=(True, True), offset=(1.0, 1.0), **options):

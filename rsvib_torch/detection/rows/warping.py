@@ -16,10 +16,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.imaging.trajectory import exposure_trajectory, gauss_node_count, rows_showing, shown_by_tones
+from rsvib_torch.imaging.trajectory import exposure_trajectory, gauss_node_count, rows_showing
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming
-from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.numerics.splines import correlated
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.registration.row_spectra import MARGIN, RowSpectra
@@ -49,11 +48,8 @@ class Positions:
         cls, scene_rows: Tensor, columns: Tensor, starts: Tensor, timing: RowTiming, motion: Motion
     ) -> "Positions":
         """Positions of given scene rows in frames that start at ``starts`` (B, G, 1)."""
-        if isinstance(motion, Vibration):
-            rows, along = shown_by_tones(scene_rows, starts, timing, motion)
-        else:
-            rows = rows_showing(scene_rows, starts, timing, motion)
-            along = motion.mean_displacement(starts + rows * timing.row_time, timing.exposure_time)[..., 0]
+        rows = rows_showing(scene_rows, starts, timing, motion)
+        along = motion.mean_displacement(starts + rows * timing.row_time, timing.exposure_time)[..., 0]
         return cls(scene_rows, columns, rows, along - columns, starts + rows * timing.row_time)
 
     def visible(self, height: int, block: int) -> Tensor:

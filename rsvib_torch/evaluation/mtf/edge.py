@@ -10,13 +10,12 @@ from rsvib_torch.checks.arrays import as_tensor
 
 
 def edge_spread(distance: Tensor, sigma: Tensor, slope: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Edge spread function of Gaussian optics and square pixels, with its derivatives.
+    """Edge and line spread function of Gaussian optics and square pixels, and the derivative of the first by sigma.
 
-    The pixel, projected on the normal of the edge, is the convolution of two boxes, as wide as the cosine and the
-    sine of the edge's angle. Their convolution with the error function of the optics is a second difference of its
-    second integral, ``J(x) = ((x^2 + sigma^2) Phi(x / sigma) + sigma x phi(x / sigma)) / 2``. Distances are in px
-    along the normal, positive on the bright side; ``slope`` is the tangent of the angle between edge and pixel. The
-    result is the edge spread function, the line spread function, and the derivative by sigma of the first.
+    The pixel, projected on the normal of the edge, is the convolution of two boxes, as wide as the cosine and the sine
+    of the edge's angle. With the error function of the optics it is a second difference of its second integral, ``J(x)
+    = ((x^2 + sigma^2) Phi(x / sigma) + sigma x phi(x / sigma)) / 2``. Distances are in px along the normal, positive on
+    the bright side; ``slope`` is the tangent of the angle between edge and pixel.
     """
     cosine = torch.rsqrt(1 + slope.square())
     wide, narrow = 0.5 * cosine, 0.5 * cosine * slope.abs()

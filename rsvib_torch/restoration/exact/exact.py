@@ -53,17 +53,15 @@ def restore_exact(
 ) -> Tensor:
     """Restore frames with all rows coupled: the most probable scene for its frames and a prior.
 
-    The kernel changes from row to row but not along a row. So the Fourier transform is taken along rows only, and for
-    each horizontal frequency the frame g is a banded matrix K times the coefficients c of the scene across rows, from
-    which a kernel of six rows interpolates. Least squares with an autoregressive prior across rows, fitted to the
-    frames, is one banded Hermitian positive definite system ``(sum_m w_m K_m^H K_m + P) c = sum_m w_m K_m^H g_m`` per
-    frequency. The interpolation error of the kernel counts as noise. Several frames of one scene add their normal
-    matrices.
+    The kernel changes from row to row but not along a row. After a Fourier transform along the rows, the frame g is for
+    each horizontal frequency a banded matrix K times the coefficients c of the scene across rows, from which a kernel
+    of six rows interpolates. Least squares with an autoregressive prior across rows, fitted to the frames, is one
+    banded Hermitian positive definite system ``(sum_m w_m K_m^H K_m + P) c = sum_m w_m K_m^H g_m`` per frequency. The
+    interpolation error of the kernel counts as noise.
 
     Arguments and result as above ``METHODS``. Values of missing pixels are estimated from all others; those of
     saturated pixels are lower bounds, which are held approximately. ``strips`` neighbouring stacks of the batch are
-    strips of columns of the same frames: they have one noise level, and one strength of the prior for each level. With
-    ``scale=2``, point (2 i, 2 j) of the result is at pixel (i, j).
+    strips of columns of the same frames: they have one noise level, and one strength of the prior for each level.
     """
     # 1. Check the options, and list the frames of each result.
     factor, scale, prior = options.regularisation, options.scale, options.prior
@@ -86,20 +84,18 @@ def restore_exact(
     # 5. On the finer grid, frames that contradict their scene show that the motion is wrong.
     if scale != 1:
         warn_of_frames(differences, model.places(scenes))
-    restored: Tensor = images.unflatten(0, (len(frames), -1))
-    return restored
+    return images.unflatten(0, (len(frames), -1))
 
 
 def scene_period(motion: FrameMotion, width: int) -> int:
     """Period in px of the scenes of all stacks with frames of ``width`` px."""
-    # the boundary extension of blurred rows is filled; that of others is longer
-    is_filled = motion.blur_lengths[..., 0].max(1) > 2 * FILLED_BLUR_REACH
-    # px beyond the displacement that influence the ends
-    margins = [8 + math.ceil(bounds[0] + 0.5) for bounds in motion.bounds]
-    return max(
-        fast_length(width + 2 * margin) if filled else extended_length(width, margin)
-        for filled, margin in zip(is_filled, margins, strict=True)
-    )
+    lengths = []
+    for bounds, blur in zip(motion.bounds, motion.blur_lengths[..., 0].max(1), strict=True):
+        margin = 8 + math.ceil(bounds[0] + 0.5)  # px beyond the displacement that influence the ends
+        # the boundary extension of blurred rows is filled; that of others is longer
+        filled = blur > 2 * FILLED_BLUR_REACH
+        lengths.append(fast_length(width + 2 * margin) if filled else extended_length(width, margin))
+    return max(lengths)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,8 +131,7 @@ class FrameModel:
         """Share (B, T) of the pixels of each frame that are measured."""
         if self.unknown is None:
             return np.ones(self.frames.shape[:2])
-        shares: NDArray[np.float64] = 1.0 - self.unknown.double().flatten(2).mean(2).cpu().numpy()
-        return shares
+        return 1.0 - self.unknown.double().flatten(2).mean(2).cpu().numpy()
 
     def scenes(self, groups: list[tuple[list[int], int]]) -> Scenes:
         """The scenes that are restored from groups of frames (``joint_groups``), stack after stack."""
@@ -181,8 +176,7 @@ class FrameModel:
 
     def _blur_reaches(self, scenes: Scenes) -> NDArray[np.float64]:
         """Largest distance (N,) along the row in px during an exposure from its middle."""
-        reaches: NDArray[np.float64] = 0.5 * self.motion.blur_lengths[scenes.stack[:, None], scenes.members, 0].max(1)
-        return reaches
+        return 0.5 * self.motion.blur_lengths[scenes.stack[:, None], scenes.members, 0].max(1)
 
     def strengths(self, scenes: Scenes) -> NDArray[np.float64]:
         """Factors (N,) on the priors, estimated from those frames whose columns are the same as in the restored one."""
@@ -221,8 +215,8 @@ class FrameModel:
         """What is missing in the data of each scene: ``"pixels"``, only the ``"extension"``, or ``"nothing"``.
 
         The boundary extension of blurred rows is missing, but not that of inner strips of columns, which end where they
-        have no weight (half the time, 0.00 dB). On the finer grid, extensions of different frames contradict each other
-        beyond half a cycle per px: filled, 49.9 dB become 53.9 dB (8 frames of 256 px, noise 0.002).
+        have no weight. On the finer grid, extensions of different frames contradict each other beyond half a cycle per
+        px: filled, 49.9 dB become 53.9 dB (8 frames of 256 px, noise 0.002).
         """
         outer = np.isin(scenes.stack % self.strips, (0, self.strips - 1))
         ends = (outer & (self._blur_reaches(scenes) > FILLED_BLUR_REACH)) | (self.scale > 1)
@@ -288,15 +282,8 @@ def model_frames(
     if noise == "auto":
         chosen = sorted({strips // 4, strips - 1 - strips // 4})
         parts = [first + strip for first in range(0, B, strips) for strip in chosen]
-        every = strips == 1
-        measured = noise_levels(
-            frames if every else frames[parts],
-            motion if every else motion.of(parts),
-            unknown if every or unknown is None else unknown[parts],
-        )
-        powers = measured.square()
-        if not every:
-            powers = powers.unflatten(0, (-1, len(chosen))).mean(1).repeat_interleave(strips, 0)
+        measured = noise_levels(frames[parts], motion.of(parts), None if unknown is None else unknown[parts])
+        powers = measured.square().unflatten(0, (-1, len(chosen))).mean(1).repeat_interleave(strips, 0)
     else:
         powers = frames.new_full((B, T), noise**2)
     powers = powers.clamp(min=MIN_LEVEL**2)
@@ -309,9 +296,8 @@ def model_frames(
     if scale == 1:
         prior = fit_prior(frames, motion, levels, period)
     else:
-        prior = [
-            fit_polynomial_prior(frames[[stack]], motion.of([stack]), levels[[stack]], period) for stack in range(B)
-        ]
+        of_stacks = ([stack] for stack in range(B))
+        prior = [fit_polynomial_prior(frames[one], motion.of(one), levels[one], period) for one in of_stacks]
     return FrameModel(
         frames=frames,
         motion=motion,
@@ -334,14 +320,11 @@ def solve_scenes(
     """Images (N, C, S H, S W) of scenes, and, on the finer grid, the differences of the frames of each scene."""
     frames, width = model.frames, model.frames.shape[-1]
     blocks = _blocks(model, scenes)
-    threads = min(Partition.threads(frames.device), len(blocks))
-    inputs = (frames, model.motion.exposures[0])
-    differentiates = torch.is_grad_enabled() and any(value.requires_grad for value in inputs)
     found: dict[int, Tensor] = {}
     differences: list[FrameDifference] = []
     advance = steps(len(scenes.stack), "frames")
 
-    def solve(block: tuple[str, list[int]], partition: Partition) -> None:
+    def solve(block: tuple[str, list[int]]) -> None:
         """Solve the scenes of a block."""
         kind, numbers = block
         some = take_stacks([scenes], np.array(numbers))
@@ -354,16 +337,15 @@ def solve_scenes(
         found.update(zip(numbers, deviations[..., : model.scale * width] + model.mean[some.stack], strict=True))
         advance(len(numbers))
 
-    if differentiates:
+    if torch.is_grad_enabled() and (frames.requires_grad or model.motion.exposures[0].requires_grad):
         for block in blocks:
-            solve(block, partition)
+            solve(block)
     else:
-        # each thread has its own memory
-        partitions = [partition, *(Partition(partition.chunk, partition.segments) for _ in range(threads - 1))]
+        threads = min(Partition.threads(frames.device), len(blocks))
 
         def share(thread: int) -> None:
             for block in blocks[thread::threads]:
-                solve(block, partitions[thread])
+                solve(block)
 
         in_parallel(share, range(threads), frames.device)
     return torch.stack([found[number] for number in range(len(scenes.stack))]), differences

@@ -35,25 +35,19 @@ def measured_values(along: Tensor, unknown: Tensor | None, shape: torch.Size, wi
     measured = inside[:, :, None, None].expand(shape).clone()
     if unknown is not None:
         measured[..., :width] &= ~unknown
-    mask: Tensor = measured
-    return mask
+    return measured
 
 
 def with_missing_values(
-    problem: SceneProblem,
-    measured: Tensor,
-    floor: Tensor | None = None,
-    *,
-    iterations: int = 8,
-    tolerance: float = 0.05,
+    problem: SceneProblem, measured: Tensor, floor: Tensor | None = None, *, iterations: int = 8
 ) -> SceneProblem:
     """The problem with missing values replaced by what the solution for all other data predicts.
 
     The missing values x solve ``x = (K c(x))`` where they are, with the solution c(x) for the filled data. Conjugate
     gradients, each step of which is one fast solution, start from the solution of the most complete frames, until the
-    residual is ``tolerance`` times the noise level. The lower bounds ``floor`` (N, M, C, R, L) of saturated pixels are
-    held approximately, by two rounds of an active set: at the beginning of each, values that are predicted below their
-    bound are set to it, and count as ``measured`` (N, M, C, R, L) from then on.
+    residual is 0.05 times the noise level. The lower bounds ``floor`` (N, M, C, R, L) of saturated pixels are held
+    approximately, by two rounds of an active set: at the beginning of each, values that are predicted below their bound
+    are set to it, and count as ``measured`` (N, M, C, R, L) from then on.
     """
     data, solver = problem.data, problem.solver(keep=True)
 
@@ -62,8 +56,7 @@ def with_missing_values(
     row_weight = weight.to(data.dtype)[:, :, None, :, None]
 
     def dot(first: Tensor, second: Tensor) -> Tensor:
-        product: Tensor = (row_weight * first * second).sum((1, 2, 3, 4), keepdim=True)
-        return product
+        return (row_weight * first * second).sum((1, 2, 3, 4), keepdim=True)
 
     def prediction(solver: SceneSolver, values: Tensor) -> Tensor:
         return solver.predict(solver.fit(values))
@@ -88,7 +81,7 @@ def with_missing_values(
             data, measured = torch.where(low, floor, data), measured | low
         # Conjugate gradients for the others, until the residual of each scene is small beside the noise.
         missing = ~measured
-        enough = (tolerance * problem.level[:, None, None, None, None]).square() * dot(missing.to(data.dtype), missing)
+        enough = (0.05 * problem.level[:, None, None, None, None]).square() * dot(missing.to(data.dtype), missing)
         residual = -residual_of(data, missing)
         direction, energy = residual, dot(residual, residual)
         for _ in range(iterations // rounds):

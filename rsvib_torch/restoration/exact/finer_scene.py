@@ -99,10 +99,9 @@ def finer_scene(problem: SceneProblem, width: int, neglected: float) -> tuple[Te
     cycles per px keep all of their contrast instead of a tenth.
 
     If this does not explain the residual, the frames differ from their model, in general by a wrong motion. The
-    differences then count as noise: detail is restored only as far as they allow. With an error of the phases of 0.05
-    rad, 27.5 dB become 32.6 dB (chart, noise 0.002, 2 frames; 32.8 dB on pixels), 34.4 become 38.1 dB with 8 frames
-    (34.7 dB on pixels). Displacements that the problem neglects, of standard deviation ``neglected`` px, count as noise
-    as well, but do not contradict the motion.
+    differences then count as noise: with an error of the phases of 0.05 rad, 27.5 dB become 32.6 dB (chart, noise
+    0.002, 2 frames; 32.8 dB on pixels), 34.4 become 38.1 dB with 8 frames (34.7 dB on pixels). Displacements that the
+    problem neglects, of standard deviation ``neglected`` px, count as noise as well, but do not contradict the motion.
     """
     factor, relaxed, largest = 1.0, torch.ones_like(problem.precision[0, 0]), math.inf
     allowed, noticed = _MAX_EFFECT, False
@@ -135,11 +134,10 @@ def phase_spread(places: Tensor, frequency: float) -> Tensor:
     return 1 - mean.square()
 
 
-def warn_of_frames(differences: list[FrameDifference], places: Iterable[Tensor], *, least: float = 0.1) -> None:
+def warn_of_frames(differences: list[FrameDifference], places: Iterable[Tensor]) -> None:
     """Warn if frames on a finer grid do not fit their model, or do not sample between each other's pixels.
 
-    ``places`` are the mean displacements (M, R, 2) of the rows of the frames of each scene. ``least`` is a limit of
-    ``phase_spread`` at 1 cycle per px, the factor on the information on aliased detail: 0.5 on average for two frames.
+    ``places`` are the mean displacements (M, R, 2) of the rows of the frames of each scene.
     """
     noticed = [difference for difference in differences if difference.noticed]
     if noticed:
@@ -147,11 +145,12 @@ def warn_of_frames(differences: list[FrameDifference], places: Iterable[Tensor],
         warn_of_restoration(
             f"the frames differ from their model by {worst.residual:.1f} times the noise, rows are displaced by about "
             f"{worst.error:.2g} px more than the vibration states: it is not accurate enough for scale=2, or the scene "
-            "changes between the frames; detail between the pixels is restored only in part and may be false",
+            "changes between the frames; detail between the pixels is restored only in part and may be false"
         )
+    # the factor on the information on aliased detail: 0.5 on average for two frames
     spread = [phase_spread(place, 1.0).mean(0) for place in places]
-    if bool((torch.stack(spread).median(0).values < least).any()):
+    if bool((torch.stack(spread).median(0).values < 0.1).any()):
         warn_of_restoration(
             "the frames of a scene sample the same points of it along at least one axis: scale=2 cannot separate "
-            "detail beyond half a cycle per px from its alias there; restore more vibrating frames jointly",
+            "detail beyond half a cycle per px from its alias there; restore more vibrating frames jointly"
         )

@@ -62,8 +62,7 @@ class MosaicSolver:
         for density, precision in zip(self._density.tolist(), precisions, strict=True):
             part = observation.weighted(density * observation.kernels.weight)
             solver = SceneSolver(part, precision, partition)
-            keep = not solver.interpolates
-            self._solvers.append(SceneSolver(part, precision, partition, keep=True) if keep else solver)
+            self._solvers.append(solver if solver.interpolates else SceneSolver(part, precision, partition, keep=True))
 
     def predict(self, coefficients: Tensor) -> Tensor:
         """Colours (M, 3, R, L) of noiseless frames of a scene with coefficients (K, 3, U)."""
@@ -71,10 +70,6 @@ class MosaicSolver:
 
     def _adjoint(self, colours: Tensor) -> Tensor:
         return self._observation.A_adjoint(_components(colours)[None])[:, :, 0]
-
-    def _normal(self, coefficients: Tensor) -> Tensor:
-        data = self._adjoint(self._weights * self.predict(coefficients))
-        return data + self._penalty(coefficients)
 
     def _penalty(self, coefficients: Tensor) -> Tensor:
         """``P_k c_k``: polynomials of the Laplacian across the rows, with mirrored ends."""
@@ -87,9 +82,8 @@ class MosaicSolver:
         return total.flatten(0, 1)
 
     def _preconditioned(self, right: Tensor) -> Tensor:
-        return torch.cat(
-            [solver.solve(right[:, k : k + 1, None])[:, :, 0] for k, solver in enumerate(self._solvers)], dim=1
-        )
+        parts = zip(self._solvers, right.split(1, 1), strict=True)
+        return torch.cat([solver.solve(part[:, :, None])[:, :, 0] for solver, part in parts], dim=1)
 
     def _dot(self, one: Tensor, other: Tensor) -> Tensor:
         """Inner product of the real scenes."""
@@ -100,10 +94,10 @@ class MosaicSolver:
             count[-1] = 1.0
         return products.sum((0, 1), dtype=torch.float64) @ count
 
-    def fit(self, data: Tensor, start: Tensor | None = None, *, iterations: int, tolerance: float = 1e-2) -> Tensor:
+    def fit(self, data: Tensor, start: Tensor | None = None, *, iterations: int) -> Tensor:
         """Coefficients (K, 3, U) for measured or assumed colours (M, 3, R, L), from the solution with the mean weights.
 
-        Iterations stop at a residual of ``tolerance`` times that of the start.
+        Iterations stop at a hundredth of the residual of the start.
         """
         if start is None:
             start = self._preconditioned(self._adjoint(self._inside * data) * self._density[:, None])
@@ -112,9 +106,9 @@ class MosaicSolver:
         step = self._preconditioned(residual)
         energy = first = self._dot(residual, step)
         for _ in range(iterations):
-            if not bool(energy > tolerance**2 * first):
+            if not bool(energy > 1e-4 * first):
                 break
-            image = self._normal(step)
+            image = self._adjoint(self._weights * self.predict(step)) + self._penalty(step)
             length = (energy / self._dot(step, image)).to(data.dtype)
             result = result + length * step
             residual = residual - length * image
@@ -139,14 +133,14 @@ def restore_mosaic(
 ) -> Tensor:
     """Colour images (B, groups, 3, scale H, scale W) from mosaics: all frames of a group and all colours together.
 
-    The scene is unknown on a grid of half pixels, as in ``restore_exact`` with ``scale=2``, and each pixel measures one
-    of its colours. Luminance and two colour differences have independent priors, fitted to frames whose missing colours
-    are first interpolated and then predicted from the restored scene. ``similar_patches`` removes noise from it. Where
-    the frames do not determine the colours, as with one frame, ``similar_patches`` interpolates those of each.
+    The scene is unknown on a grid of half pixels, and each pixel measures one of its colours. Luminance and two colour
+    differences have independent priors, fitted to frames whose missing colours are first interpolated and then
+    predicted from the restored scene. ``similar_patches`` removes noise from it, and interpolates the colours of each
+    frame where the frames do not determine them, as with one frame.
 
-    Arguments as above ``METHODS``; ``colours`` (B, T, 1, H, W) is the colour that each pixel measures, 0 to 2, and the
-    prior declares ``mosaic`` in ``PRIORS``. ``noise="auto"`` is estimated from the residual of the frames of a group.
-    With one frame it is hardly known, and too low rather than too high.
+    Arguments as above ``METHODS``; ``colours`` (B, T, 1, H, W) is the colour that each pixel measures, 0 to 2.
+    ``noise="auto"`` is estimated from the residual of the frames of a group; that of one frame is too low rather than
+    too high.
     """
     # 1. Check the options, and list the frames of each result.
     height, width = frames.shape[-2:]
@@ -164,9 +158,7 @@ def restore_mosaic(
         # 3. The colours of a stack, interpolated where they are not measured, and the level of its noise.
         measured = measures(colours[stack])
         linear = interpolated_colours(mosaic, colours[stack])
-        floor = None
-        if clipped is not None:
-            floor = torch.where(measured & clipped[stack], mosaic, -torch.inf)
+        floor = None if clipped is None else torch.where(measured & clipped[stack], mosaic, -torch.inf)
         if ignore is not None:
             measured = measured & ~ignore[stack]
         if stated is None:  # of colours whose noise was halved by interpolation
@@ -191,8 +183,7 @@ def restore_mosaic(
             observation = FinerObservation(kernels, height, length, frames.dtype)
             images.append(part.restored(observation, shift[:, 0], stated is None, factor, partition, scale))
             advance()
-    restored: Tensor = torch.stack(images).unflatten(0, (-1, len(groups)))
-    return restored
+    return torch.stack(images).unflatten(0, (-1, len(groups)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,7 +245,14 @@ class _Frames:
             full = torch.where(self.measured, full, predicted[..., :width] + mean)
             if count > 1:
                 residual_level, gain = _residual_level(first, data - predicted, measured)
-                level = self._checked(residual_level, level, unknown_level)
+                if unknown_level:
+                    level = residual_level
+                elif bool(residual_level > 1.5 * level):
+                    warn_of_restoration(
+                        f"the frames differ from their model by {float(residual_level / level):.1f} times the stated "
+                        "noise: the vibration is not accurate enough, the scene changes between the frames, or noise "
+                        "is too low; colours may be false"
+                    )
             if self.floor is not None:  # saturated values are lower bounds: only those above the prediction count
                 measured[..., :width] &= (predicted[..., :width] + mean <= self.floor) | self.floor.isinf()
         second = solver(regularisation)
@@ -265,23 +263,7 @@ class _Frames:
         # 3. Remove the noise that is left; the points of each pixel are four images, one at a time: less memory.
         points = pixel_unshuffle(scene, scale).unflatten(0, (3, -1)).movedim(1, 0).split(1)
         points = [similar_patches(part, part, None, gain * level, rounds=2, steps=2) for part in points]
-        image: Tensor = pixel_shuffle(torch.cat(points).movedim(0, 1).flatten(0, 1), scale)
-        return image
-
-    def _checked(self, residual: Tensor, stated: Tensor, unknown: bool, *, most: float = 1.5) -> Tensor:
-        """The standard deviation of the noise to use: that of the residual if none is stated.
-
-        Warns if the residual is larger than the stated noise explains.
-        """
-        if unknown:
-            return residual
-        if bool(residual > most * stated):
-            warn_of_restoration(
-                f"the frames differ from their model by {float(residual / stated):.1f} times the stated noise: the "
-                "vibration is not accurate enough, the scene changes between the frames, or noise is too low; colours "
-                "may be false"
-            )
-        return stated
+        return pixel_shuffle(torch.cat(points).movedim(0, 1).flatten(0, 1), scale)
 
     def _precisions(
         self, images: Tensor, observation: FinerObservation, level: Tensor, regularisation: float
@@ -296,14 +278,10 @@ class _Frames:
         ]
 
 
-def _same_colours(displacement: Tensor, node_weights: Tensor, *, least: float = 0.1) -> bool:
-    """Whether frames measure the same colour at the same points along both axes; with a warning.
-
-    Displacements are (M, R, N, 2) px; ``least`` is a limit of ``phase_spread`` at 1/2 cycle per px, the pattern of
-    colours.
-    """
+def _same_colours(displacement: Tensor, node_weights: Tensor) -> bool:
+    """Whether frames with displacements (M, R, N, 2) px measure the same colour at the same points; with a warning."""
     place = (displacement * node_weights[:, None]).sum(-2)
-    same = bool((phase_spread(place, 0.5).median(0).values < least).all())
+    same = bool((phase_spread(place, 0.5).median(0).values < 0.1).all())  # at 1/2 cycle per px, the pattern of colours
     if same:
         warn_of_restoration(
             "the frames of a scene measure the same colours at the same points of it: the other colours are "

@@ -46,7 +46,7 @@ def edges(problem: SceneProblem, regularisation: float) -> Tensor:
     """
     kernels = problem.observation.kernels
     solver = replace(problem, precision=0.3 * problem.precision).solver()
-    right_side = solver.right_side(problem.data)
+    right_side = problem.observation.A_adjoint(problem.data)
     coefficients = solver.solve(right_side)
     # total weight of the frames of each scene
     weight = kernels.weight.detach().mean(-1).unflatten(0, (len(problem.data), -1)).sum(-1)
@@ -100,10 +100,9 @@ def check_prior(prior: str, *, scale: int = 1, mosaic: bool = False) -> None:
 
 
 def _cosines_of_neighbours(like: Tensor) -> Tensor:
-    """Orthonormal cosines of neighbouring patches along a side, one in each row; the first of a patch is constant.
+    """Orthonormal cosines (neighbours x 8, 14) of neighbouring patches along a side; the first of a patch is constant.
 
-    One product with these (neighbours x 8, 14) transforms four patches, and one with the transpose adds them up, which
-    takes three quarters of the time of single patches.
+    One product transforms four patches, and one with the transpose adds them up: 3/4 of the time of single patches.
     """
     order = torch.arange(_PATCH, dtype=torch.float64, device="cpu")
     waves = torch.cos(torch.pi * order[:, None] * (order + 0.5) / _PATCH) * math.sqrt(2.0 / _PATCH)

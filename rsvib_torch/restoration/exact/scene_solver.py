@@ -12,10 +12,9 @@ frequencies and interpolates the factors for all others.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from math import prod
 
 import torch
 from torch import Tensor
@@ -37,10 +36,6 @@ def row_windows(rows: int, count: int, overlap: int = 96) -> list[slice]:
 
     The dependence of a solution on distant rows decreases exponentially: windows are solved side by side, and the rows
     of the overlap are discarded. With 96 rows the solution changes by about 1e-5 unless the exposure blurs.
-
-    Example:
-        >>> row_windows(10, 2, overlap=1)
-        [slice(0, 6, None), slice(4, 10, None)]
     """
     size = -(-(rows + 2 * overlap * (count - 1)) // count)
     if count <= 1 or size >= rows:
@@ -58,14 +53,13 @@ def join_windows(values: Tensor, windows: list[slice]) -> Tensor:
     return torch.cat([values[a - w.start : b - w.start, ..., k, :] for k, (w, (a, b)) in enumerate(parts)])
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True)
 class Partition:
-    """Which parts of the systems of a scene are solved at a time, in memory that is used again."""
+    """Which parts of the systems of a scene are solved at a time."""
 
     chunk: int | None = None  # frequencies solved at a time; None: chosen by memory
     # number of windows of rows; None: as many as make a step of the elimination worth its call
     segments: int | None = None
-    _buffers: dict[int, Tensor] = field(default_factory=dict)
 
     @staticmethod
     def threads(device: torch.device) -> int:
@@ -78,8 +72,7 @@ class Partition:
 
         A single scene takes 32 MB, or 4 times the memory of its spectrum, for each of two chunks at a time on a CPU, so
         that results do not depend on the number of threads. Where exposures blur, the rows are not divided, and a step
-        of the elimination has fewer values: twice the memory saves 18 % of the time for frames of 1024 and 2048 rows,
-        four times the memory 30 %.
+        of the elimination has fewer values: twice the memory saves 18 % of the time for 1024 and 2048 rows.
         """
         if device.type == "cpu":
             values = max(1 << 22, 4 * rows * frequencies) if single else 1 << 24
@@ -115,21 +108,12 @@ class Partition:
         count = self.segments or max(1, rows // (512 if device.type == "cpu" else 256))
         return runs(frequencies, chunk), row_windows(rows, count)
 
-    def buffer(self, thread: int, shape: tuple[int, ...], like: Tensor) -> Tensor:
-        """Memory of a thread: page faults in fresh memory take as long as the elimination."""
-        if thread not in self._buffers or self._buffers[thread].numel() < prod(shape):
-            self._buffers.pop(thread, None)
-            self._buffers[thread] = like.new_empty(prod(shape))
-        memory: Tensor = self._buffers[thread][: prod(shape)].view(shape)
-        return memory
-
 
 class SceneSolver:
-    """Solver of the normal equations of N scenes.
+    """Solver of the normal equations of N scenes; ``keep`` keeps the factors, for solving several times.
 
     The ``precision`` P are products (p + 1, p + 1, N, U) as from ``RowPrior.precision``, in units of the noise of
-    weight 1. ``keep`` keeps the factors, for solving several times. ``parts`` are the frequencies that are solved at a
-    time.
+    weight 1. ``parts`` are the frequencies that are solved at a time.
     """
 
     def __init__(
@@ -137,7 +121,7 @@ class SceneSolver:
     ) -> None:
         self.observation, self.precision, self.u = observation, precision, observation.u
         normal = observation.normal(len(precision) - 1)
-        self._partition = partition
+
         self.parts, self._windows = partition.divide(
             observation.count,
             normal.width,
@@ -183,16 +167,8 @@ class SceneSolver:
 
     def fit(self, data: Tensor) -> Tensor:
         """Coefficients (K, C, N, U) of the scenes for data (N, M, C, R, L), whose rows are extended to a period."""
-        spectra: Tensor = torch.fft.rfft(data)
-        return self._solution(lambda part: self._right_side(spectra, part), spectra)
-
-    def right_side(self, data: Tensor) -> Tensor:
-        """Right sides (K, C, N, U) of the normal equations for data (N, M, C, R, L)."""
         spectra = torch.fft.rfft(data)
-        return torch.cat([self._right_side(spectra, part) for part in self.parts], dim=-1)
-
-    def _right_side(self, spectra: Tensor, part: slice) -> Tensor:
-        return self.observation.adjoint(spectra[..., part], part)
+        return self._solution(lambda part: self.observation.adjoint(spectra[..., part], part), spectra)
 
     def solve(self, right: Tensor) -> Tensor:
         """Solution (K, C, N, U) of the normal equations for right sides (K, C, N, U)."""
@@ -200,31 +176,26 @@ class SceneSolver:
 
     def _solution(self, right_side: Callable[[slice], Tensor], given: Tensor) -> Tensor:
         """Solution (K, C, N, U) for right sides (K, C, N, S) of parts of the frequencies, computed from ``given``."""
-        interpolated: dict[int, BandedFactor] = {}  # of each thread, in memory that is used again
-        factors = self._factors if self._keep and not self._differentiates(given) else []
+        differentiates = self._differentiates(given)
+        factors = self._factors if self._keep and not differentiates else []
         scenes, windows = self.observation.num_scenes, self._windows
 
-        def solve(number: int, thread: int | None = None) -> Tensor:
+        def solve(number: int) -> Tensor:
             part = self.parts[number]
-            u = self.u[part]
             # windows of the rows, (R, C, N W S)
             whole = right_side(part)
             right = torch.stack([whole[window] for window in windows], dim=3).flatten(2)
+            system: Tensor | BandedFactor
             if self._interpolated is not None:
-                factor = self._interpolated.at(part, None if thread is None else interpolated.get(thread))
-                if thread is not None:
-                    interpolated[thread] = factor
-                solution = solve_halves(factor, right)
+                system = self._interpolated.at(part)
             elif factors:
-                solution = solve_halves(factors[number], right)
+                system = factors[number]
             else:
-                left = self._normal.left
-                shape = (*left.shape[:4], len(u))
-                out = None if thread is None else self._partition.buffer(thread, shape, given)
-                solution = solve_halves(self._normal.at(u, self.precision[..., part], out), right)
+                system = self._normal.at(self.u[part], self.precision[..., part])
+            solution = solve_halves(system, right)
             return join_windows(solution.unflatten(-1, (scenes, len(windows), -1)), windows)
 
-        if self._differentiates(given):
+        if differentiates:
             return torch.cat([solve(number) for number in range(len(self.parts))], dim=-1)
         channels = given.shape[-3 if given.ndim == 5 else 1]
         coefficients: Tensor = given.new_empty(self.observation.count, channels, scenes, len(self.u))
@@ -232,7 +203,7 @@ class SceneSolver:
 
         def share(thread: int) -> None:
             for number in range(thread, len(self.parts), threads):
-                coefficients[..., self.parts[number]] = solve(number, thread)
+                coefficients[..., self.parts[number]] = solve(number)
 
         in_parallel(share, range(threads), given.device)
         return coefficients
@@ -240,8 +211,7 @@ class SceneSolver:
     def predict(self, coefficients: Tensor) -> Tensor:
         """Noiseless frames (N, M, C, R, L) of the scenes, ``K c``."""
         spectra = [self.observation.forward(coefficients[..., part], part) for part in self.parts]  # less memory
-        images: Tensor = torch.fft.irfft(torch.cat(spectra, dim=-1), n=self.observation.period)
-        return images
+        return torch.fft.irfft(torch.cat(spectra, dim=-1), n=self.observation.period)
 
     def image(self, coefficients: Tensor) -> Tensor:
         """Rows of the scenes where the frame at rest would observe them, (N, C, R, L); twice as many if finer."""

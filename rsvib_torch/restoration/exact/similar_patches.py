@@ -70,8 +70,7 @@ def _round(images: Tensor, values: Tensor, measured: Tensor | None, level: Tenso
     def joined(parts: Tensor) -> Tensor:
         return functional.fold(parts.unflatten(0, (count, -1)).mT, (height, width), _PATCH)
 
-    image: Tensor = joined(total) / joined(weight[:, None].expand(-1, size))
-    return image
+    return joined(total) / joined(weight[:, None].expand(-1, size))
 
 
 def _references(size: int, device: torch.device) -> Tensor:
@@ -92,9 +91,7 @@ def _similar(images: Tensor, starts: Tensor, places: Tensor, period: int) -> Ten
     ends = (max(0, begin - _REACH), min(height, end + _REACH))
     above, below = begin - ends[0], ends[1] - end
     wide = functional.pad(
-        images[..., ends[0] : ends[1], :],
-        (_REACH, _REACH, _REACH - above, _REACH - below),
-        value=torch.inf,
+        images[..., ends[0] : ends[1], :], (_REACH, _REACH, _REACH - above, _REACH - below), value=torch.inf
     )
     # 2. For each place in the pattern, the distances of the patches at all moves that lead to it, and the nearest ones.
     numbers = []

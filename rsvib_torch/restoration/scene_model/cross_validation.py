@@ -63,16 +63,13 @@ class SampledRows:
 
 
 @torch.no_grad()
-def sample_rows(
-    images: Tensor, kernels: RowKernels, chosen: NDArray[np.int64], slab_rows: int = _SLAB_ROWS
-) -> SampledRows:
+def sample_rows(images: Tensor, kernels: RowKernels, chosen: NDArray[np.int64]) -> SampledRows:
     """Spectra of tapered rows of images (S, M, C, R, W) at frequencies (F,), cycles in W px, in slabs of equal height.
 
-    ``kernels`` are those of the rows of S M images, of a scene one after the other. Rows beyond the last slab are not
-    used.
+    ``kernels`` are those of the rows of S M images. Rows beyond the last slab are not used.
     """
     scenes, members, channels = images.shape[:3]
-    slabs = max(1, images.shape[-2] // slab_rows)
+    slabs = max(1, images.shape[-2] // _SLAB_ROWS)
     height, width = images.shape[-2] // slabs, images.shape[-1]
     images, kernels = images[..., : slabs * height, :], kernels.rows(0, slabs * height)
     # spectra of the rows, minus the mean of the image, with the phase of each row's middle taken off
@@ -85,9 +82,7 @@ def sample_rows(
 
     def in_slabs(values: Tensor) -> Tensor:
         """(S M, n height, ...) as (S n M, height, ...)."""
-        parts = values.unflatten(1, (slabs, height)).unflatten(0, (scenes, members))
-        joined: Tensor = parts.transpose(1, 2).flatten(0, 2)
-        return joined
+        return values.unflatten(1, (slabs, height)).unflatten(0, (scenes, members)).transpose(1, 2).flatten(0, 2)
 
     # coefficients of a slab count from its first row
     first = kernels.first - height * (torch.arange(slabs * height, device=images.device) // height)
@@ -99,7 +94,7 @@ def sample_rows(
     return SampledRows(observation, spectra, channels * float((taper**2).sum()))
 
 
-_STRENGTHS = (2.0, 1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # factors on the prior, from strong to weak
+_STRENGTHS = np.array([2.0, 1.0, 0.5, 0.25, 0.12, 0.06, 0.03])  # factors on the prior, from strong to weak
 _TRIED = 4  # of them, first
 _FREQUENCIES = 24  # at which rows are sampled
 _ROWS = 512  # sampled, from the middle of the frames
@@ -107,22 +102,16 @@ _ROWS = 512  # sampled, from the middle of the frames
 
 @torch.no_grad()
 def prior_strengths(
-    images: Tensor,
-    kernels: RowKernels,
-    prior: RowPrior,
-    noise_power: Tensor,
-    blur_reach: Tensor,
-    *,
-    certain: bool = True,
+    images: Tensor, kernels: RowKernels, prior: RowPrior, noise_power: Tensor, blur_reach: Tensor, *, certain: bool
 ) -> NDArray[np.float64]:
     """Factors (S,), of a few, on the prior for restoring S scenes, selected by cross-validation.
 
     The prior is fitted to the power spectrum of the frames minus that of the noise. A weaker one predicts pixels better
     where dense texture is taken for noise, or where the scene differs from its mean spectrum.
 
-    The images (S, M, C, R, W) are in row order; ``noise_power`` (S, 1) is that of images of weight 1, ``blur_reach``
-    (S, 1) as in ``RowPrior.precision``. The noise level is ``certain`` if it is given or estimated from several frames:
-    that of a single frame includes texture, so that the prior cannot be too weak.
+    The images (S, M, C, R, W) are in row order; ``noise_power`` (S, 1) is that of images of weight 1. The noise level
+    is ``certain`` if it is given or estimated from several frames: that of a single frame includes texture, so that the
+    prior cannot be too weak.
     """
     height, width = images.shape[-2:]
     if min(height, width) < 64:  # too few values for a choice
@@ -135,18 +124,12 @@ def prior_strengths(
     chosen = np.linspace(0.02 * width, width // 2, number, dtype=np.float32).astype(np.int64)
     sample = sample_rows(images[..., top : top + count, :], kernels.rows(top, count), chosen)
     place = torch.from_numpy(np.rint(chosen / width * 2 * (prior.power.shape[-1] - 1)).astype(np.int64))
-    at = RowPrior(
-        *(
-            values[..., place.to(values.device)]
-            for values in (prior.power, prior.reflections, prior.interpolation_power)
-        )
-    )
+    at = RowPrior(*(values[..., place.to(values.device)] for values in vars(prior).values()))
     # 2. A stronger prior is allowed only if the noise level is certain, and can be distinguished from the interpolation
     # error of the kernel. The strongest priors are tried first, and all only if the weakest of them is selected.
-    strengths = np.array(_STRENGTHS)
     above = table(noise_power)[:, 0] > 200.0 * table(prior.interpolation_power.mean((1, 2)))
-    allowed = (above & certain) | (strengths[:, None] <= 1.0)
-    octaves = np.log2(strengths)[:, None]
+    allowed = (above & certain) | (_STRENGTHS[:, None] <= 1.0)
+    octaves = np.log2(_STRENGTHS)[:, None]
     # strength 1 follows from the noise level: another must reduce the logarithm by this much per octave, weaker or
     # stronger
     handicap = np.maximum(-0.014 * octaves, 0.002 * octaves)
@@ -157,7 +140,7 @@ def prior_strengths(
         # ``n |r|^2 / (n - freedom)^2`` of Craven and Wahba (1979) estimates the squared error of predicting a pixel
         # from all others. The sum over the frequencies is dominated by those with the largest errors; the geometric
         # mean gives all the same weight. The weaker of the two selected priors is used, as it has the smaller error.
-        precisions = [at.precision(noise_power, strength, blur_reach) for strength in _STRENGTHS[:tried]]
+        precisions = [at.precision(noise_power, strength, blur_reach) for strength in _STRENGTHS[:tried].tolist()]
         explained = sample.explain(torch.stack(precisions))
         rest = explained.count[:, None] - explained.freedom
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -165,5 +148,4 @@ def prior_strengths(
             geometric = (np.log(explained.power) - 2 * np.log(rest)).mean(-1)
         criteria = (np.where(allowed[:tried], values + handicap[:tried], np.inf) for values in (of_sum, geometric))
         selected = np.maximum(*(criterion.argmin(0) for criterion in criteria))
-    result: NDArray[np.float64] = strengths[selected]
-    return result
+    return _STRENGTHS[selected]

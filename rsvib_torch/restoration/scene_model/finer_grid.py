@@ -62,8 +62,7 @@ class FinerKernels(RowKernels):
         alias = (2 * math.pi) * self.middle[..., None, None] * both.new_tensor([[0.0], [1.0]])
         waves = torch.polar(torch.ones_like(angle), angle + alias[..., None])  # (M, R, a, N, Q)
         taps = self.taps.unflatten(-2, (-1, SCALE)).transpose(-3, -2)  # (M, R, a, J, N)
-        kernels: Tensor = (taps.to(waves.dtype) @ waves).transpose(-3, -2).flatten(-3, -2)
-        return kernels
+        return (taps.to(waves.dtype) @ waves).transpose(-3, -2).flatten(-3, -2)
 
 
 def _spline_transfer(frequencies: Tensor) -> Tensor:
@@ -90,12 +89,12 @@ class FinerBand(SmoothBand):
     ``left`` contains the bands of ``T^m`` for both aliases behind the real and imaginary parts at the nodes.
     """
 
-    def at(self, u: Tensor, precision: Tensor, out: Tensor | None = None) -> Tensor:
+    def at(self, u: Tensor, precision: Tensor) -> Tensor:
         """Skewed bands as in ``SmoothBand.at``, for a precision (p + 1, 2, U) as of ``PolynomialPrior.precision``."""
         prior = torch.stack([precision, torch.zeros_like(precision)], dim=-1).flatten(-2).flatten(0, 1)
         interpolation = interpolation_matrix(self.reach, u, self.left.dtype, symmetric=False)[1]
         right = torch.cat([interpolation.to(prior), prior])
-        return torch.view_as_complex(self._product(right, out)).flatten(2)
+        return torch.view_as_complex(self._product(right)).flatten(2)
 
 
 def _laplacian_powers(count: int, order: int, device: torch.device) -> Tensor:
@@ -106,9 +105,8 @@ def _laplacian_powers(count: int, order: int, device: torch.device) -> Tensor:
     powers = [torch.zeros(count, 2 * order + 1, dtype=torch.float64, device=device)]
     powers[0][:, order] = 1.0
     for _ in range(order):
-        powers.append(
-            sum((step[:, 1 + f, None] * powers[-1].roll((-f, f), (0, 1)) for f in (-1, 0, 1)), start=step.new_zeros(()))
-        )
+        above, here, below = (step[:, 1 + f, None] * powers[-1].roll((-f, f), (0, 1)) for f in (-1, 0, 1))
+        powers.append(above + here + below)
     return torch.stack(powers, dim=-1)
 
 
@@ -136,13 +134,10 @@ class FinerObservation(Observation):
         first = -SCALE * _FINER_SCENE_REACH - self.top
         count = SCALE * self.num_rows
         rows = coefficients[first : first + SCALE * (count + 2 * _FINER_SCENE_REACH)].unflatten(0, (-1, SCALE))
-        sampled = sum(
-            (weight * rows[k : k + count] for k, weight in enumerate(_finer_scene_weights())), start=rows.new_zeros(())
-        )
-        low, alias = sampled.unbind(1)  # at u and u - 1; the scene is real
+        weighted = [weight * rows[k : k + count] for k, weight in enumerate(_finer_scene_weights())]
+        low, alias = sum(weighted[1:], start=weighted[0]).unbind(1)  # at u and u - 1; the scene is real
         spectra = torch.cat([low, alias[..., :-1].flip(-1).conj()], dim=-1)
-        scene: Tensor = torch.fft.irfft(spectra.permute(2, 1, 0, 3), n=SCALE * self.period) * SCALE
-        return scene
+        return torch.fft.irfft(spectra.permute(2, 1, 0, 3), n=SCALE * self.period) * SCALE
 
 
 # Degree 6 instead of 4: 0.6 to 1.0 dB for eight frames of scenes with little detail beyond half a cycle per px, -0.4 dB
@@ -206,9 +201,7 @@ class PolynomialPrior:
 
 
 @torch.no_grad()
-def fit_polynomial_prior(
-    frames: Tensor, motion: FrameMotion, levels: Tensor, length: int, iterations: int = 60
-) -> PolynomialPrior:
+def fit_polynomial_prior(frames: Tensor, motion: FrameMotion, levels: Tensor, length: int) -> PolynomialPrior:
     """Fit the prior to the frames (1, T, C, H, W) of one stack in row order, whose spectrum is blurred and aliased.
 
     The expected power of a frame at (u, v) is that of the noise (1, T) plus that of the scene, through the blur of the
@@ -217,9 +210,8 @@ def fit_polynomial_prior(
     """
     spectrum = observed_spectrum(frames, motion, levels, length)
     u, v = spectrum.u[:, None], spectrum.v
-    observed, weight, noise = (
-        values[0] for values in spectrum.weighted(smeared(spectrum.blur(spectrum.u, spectrum.v)))
-    )
+    transfer = smeared(spectrum.blur(spectrum.u, spectrum.v))
+    observed, weight, noise = (values[0] for values in spectrum.weighted(transfer))
     # transfer function and powers of the Laplacians at each alias
     gains, features = [], []
     rising, order = _rising_powers(frames.device), torch.arange(_DEGREE + 1, device=frames.device)
@@ -238,7 +230,7 @@ def fit_polynomial_prior(
     # start from a white spectrum of the mean level
     middle = (observed - noise).clamp(min=0.01 * noise)[used].log().mean().exp()
     logs = torch.full((len(_POWERS),), -float(middle.log()), dtype=torch.float64, device=frames.device)
-    for _ in range(iterations):
+    for _ in range(60):
         # expected power of the frames, and its derivative with respect to the logarithms
         terms = feature * logs.exp()
         polynomial = terms.sum(-1)

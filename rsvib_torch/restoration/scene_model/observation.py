@@ -87,7 +87,7 @@ def scene_weights() -> tuple[float, ...]:
     """Weights of the coefficients of rows -5 ... 5 in a row of the scene.
 
     On the rows, a wave of coefficients interpolated by the kernel has the amplitude of ``kernel_spectrum`` plus that of
-    its aliases. Exposures, and frames that sample at many places, do not contain the aliases. So the scene is the
+    its aliases, which exposures, and frames that sample at many places, do not contain. So the scene is the
     interpolation without aliases: the least-squares fit of these weights to ``kernel_spectrum`` up to 0.46 cycles per
     row, for amplitude spectra like frequency^-1 behind Gaussian optics of sigma 0.6 px.
     """
@@ -99,14 +99,13 @@ def scene_weights() -> tuple[float, ...]:
 
 
 def cosine_series(angles: Array, values: Array, reach: int, counts: Array | float = 1.0) -> Array:
-    """Weights 0 ... ``reach`` of the symmetric filter whose transfer function at ``angles`` (rad) is nearest to values.
+    """Weights 0 ... ``reach`` of the symmetric filter whose transfer at ``angles`` (rad) is nearest to values.
 
     Squared differences times the squares of ``counts`` are least.
     """
     order = np.arange(reach + 1)
     cosines = np.cos(angles[:, None] * order) * np.where(order > 0, 2.0, 1.0)
-    half: Array = np.linalg.lstsq(cosines * np.reshape(counts, (-1, 1)), values * counts)[0]
-    return half
+    return np.linalg.lstsq(cosines * np.reshape(counts, (-1, 1)), values * counts)[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,32 +205,6 @@ def _stacked(values: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False)
-class SmoothKernels:
-    """Kernels at any frequencies by one matrix product."""
-
-    left: Tensor  # (J, M R, 2 Q) real and imaginary parts at Q nodes of every tap of every row
-    reach: float  # largest distance along the rows in px from their middles
-    symmetric: bool = True  # whether kernels at -u are the conjugates of those at u
-
-    def taps(self, u: Tensor, *, conjugate: bool = False) -> Iterator[tuple[slice, Tensor]]:
-        """Kernels (j, M R, U) of some taps, or their conjugates, without the phase of their middles: less memory."""
-        right = interpolation_matrix(self.reach, u, self.left.dtype, symmetric=self.symmetric)[1]
-        if conjugate:
-            right[:, 1::2].neg_()
-        right = right.to(self.left)
-        count = at_once(self.left.element_size() * self.left[0, :, 0].numel() * right.shape[1], right.device)
-        for part in runs(len(self.left), count):
-            yield part, torch.view_as_complex((self.left[part] @ right).unflatten(-1, (-1, 2)))
-
-
-def smooth_kernels(kernels: RowKernels, dtype: torch.dtype) -> SmoothKernels:
-    """Kernels of all rows at the Chebyshev nodes."""
-    nodes, _ = interpolation_matrix(kernels.blur_reach, None, dtype, symmetric=kernels.symmetric)
-    left = _stacked(kernels.at(nodes.to(kernels.middle.device))).to(dtype).flatten(0, 1).transpose(0, 1).contiguous()
-    return SmoothKernels(left, kernels.blur_reach, kernels.symmetric)
-
-
-@dataclass(frozen=True, eq=False)
 class SmoothBand:
     """Normal matrices of N scenes at any frequencies by one matrix product, to which the prior is added."""
 
@@ -253,13 +226,12 @@ class SmoothBand:
         left = from_both_ends(torch.cat([parts, parts.new_zeros(self.width, *parts.shape[1:])]))
         return replace(self, left=left, windows=len(windows), rows=len(parts))
 
-    def at(self, u: Tensor, precision: Tensor, out: Tensor | None = None) -> Tensor:
+    def at(self, u: Tensor, precision: Tensor) -> Tensor:
         """Halves (H + b, 2 b + 1, 2 n U) of the matrices in windows, complex, at frequencies u (U,) in cycles per px.
 
-        The ``precision`` are products (p + 1, p + 1, N, U) of the prior there; ``out`` is memory for the halves: page
-        faults in fresh memory take as long as the product that fills it.
+        The ``precision`` are products (p + 1, p + 1, N, U) of the prior there.
         """
-        bands = self._product(interpolation_matrix(self.reach, u, self.left.dtype, symmetric=True)[1], out)
+        bands = self._product(interpolation_matrix(self.reach, u, self.left.dtype, symmetric=True)[1])
         order, half = len(precision) - 1, len(self.left) - self.width
         # what is added to the diagonals of the first p rows of the scene, of all rows, and of the first p middle rows
         selected = constant(prior_diagonals, order, dtype=precision.dtype, device=precision.device)
@@ -279,14 +251,9 @@ class SmoothBand:
         second[:order, ..., -1:, :].add_(ends)
         return torch.view_as_complex(bands).flatten(2)
 
-    def _product(self, right: Tensor, out: Tensor | None) -> Tensor:
+    def _product(self, right: Tensor) -> Tensor:
         """Products (H + b, 2 b + 1, 2, n, U, 2) with a matrix."""
-        rows, right = self.left.flatten(0, 3), right.to(self.left)
-        if out is None:
-            product = rows @ right
-        else:
-            product = torch.mm(rows, right, out=torch.view_as_real(out).view(len(rows), -1))
-        return product.view(*self.left.shape[:4], -1, 2)
+        return (self.left @ right.to(self.left)).unflatten(-1, (-1, 2))
 
 
 @cache
@@ -327,20 +294,16 @@ def normal_matrices(
     for part in runs(taps, at_once(16 * values.numel(), nodes.device)):  # few taps at a time: less memory
         products = weighted[..., part, None, :] * values[..., None, :, :]
         bands = bands.index_add_(0, first[..., part, :].flatten(), products.flatten(0, 3))
-    normal: Tensor = _stacked(bands).view(num_scenes, count + width, diagonals, -1).permute(1, 2, 0, 3)
-    return normal
+    return _stacked(bands).view(num_scenes, count + width, diagonals, -1).permute(1, 2, 0, 3)
 
 
 class Observation:
     """The observation operator K of N scenes, each observed by M frames of R rows of period L, and its normal matrices.
 
     ``A`` and ``A_adjoint`` have images of whole frames; ``forward`` and ``adjoint`` have spectra of some frequencies.
-
-    Attributes:
-        kernels: Kernels of the rows of N M frames, those of a scene one after the other.
-        u: (U,) frequencies along the rows in cycles per px, on the CPU.
-        top: First scene row that is observed or needed to evaluate a scene, in frame coordinates.
-        count: Number of such scene rows, K.
+    The ``kernels`` are those of the rows of N M frames, of a scene one after the other; ``u`` (U,) are the frequencies
+    along the rows in cycles per px, on the CPU. ``count`` scene rows K, from ``top`` on in frame coordinates, are
+    observed or needed to evaluate a scene.
     """
 
     kernels_of_rows = RowKernels.of_rows  # makes the kernels
@@ -354,7 +317,10 @@ class Observation:
         lowest, highest = torch.stack(kernels.first.aminmax()).tolist()
         self.top = min(lowest, first)
         self.count = max(highest + kernels.taps.shape[-2], last) - self.top
-        self._smooth = smooth_kernels(kernels, dtype)
+        # real and imaginary parts of every tap of every row (J, N M R, 2 Q) at Q Chebyshev nodes
+        nodes, _ = interpolation_matrix(kernels.blur_reach, None, dtype, symmetric=kernels.symmetric)
+        at_nodes = _stacked(kernels.at(nodes.to(kernels.middle.device))).to(dtype)
+        self._at_nodes = at_nodes.flatten(0, 1).transpose(0, 1).contiguous()
         scene = torch.arange(num_scenes, device=kernels.first.device)[:, None, None]
         place = kernels.first.unflatten(0, (num_scenes, -1)) - self.top + self.count * scene
         # coefficients of the taps of each row (J, N M R), of all scenes one after the other
@@ -384,10 +350,23 @@ class Observation:
         other.period, other.u = period, u
         return other
 
+    def _taps(self, part: slice, *, conjugate: bool = False) -> Iterator[tuple[Tensor, Tensor]]:
+        """Places (j, N M R) of a few taps at a time, which need less memory, and their kernels (j, N M R, S).
+
+        The kernels, or their conjugates, are without the phase of the middle.
+        """
+        left, reach, symmetric = self._at_nodes, self.kernels.blur_reach, self.kernels.symmetric
+        right = interpolation_matrix(reach, self.u[part], self.dtype, symmetric=symmetric)[1]
+        if conjugate:
+            right[:, 1::2].neg_()
+        right = right.to(left)
+        count = at_once(left.element_size() * left.shape[1] * right.shape[1], left.device)
+        for taps in runs(len(left), count):
+            yield self._places[taps], torch.view_as_complex((left[taps] @ right).unflatten(-1, (-1, 2)))
+
     def A(self, coefficients: Tensor) -> Tensor:  # noqa: N802 - name that solvers use
         """Frames ``K c`` (N, M, C, R, L) of scenes with coefficients (K, C, N, U)."""
-        frames: Tensor = torch.fft.irfft(self.forward(coefficients, slice(0, len(self.u))), n=self.period)
-        return frames
+        return torch.fft.irfft(self.forward(coefficients, slice(0, len(self.u))), n=self.period)
 
     def A_adjoint(self, frames: Tensor) -> Tensor:  # noqa: N802 - name that solvers use
         """``K^H W g`` (K, C, N, U) of frames (N, M, C, R, L)."""
@@ -398,13 +377,12 @@ class Observation:
         # sum over the taps of each row of all frames
         flat = coefficients.movedim(2, 0).flatten(0, 1)
         rows = flat.new_zeros(self._places.shape[1], *flat.shape[1:])
-        for taps, kernel in self._smooth.taps(self.u[part]):
-            rows = rows + (kernel[:, :, None] * flat[self._places[taps]]).sum(0)
+        for places, kernel in self._taps(part):
+            rows = rows + (kernel[:, :, None] * flat[places]).sum(0)
         # displacement of the middle of each row
         phases = shift_phases(self.kernels.middle, self.period, part, flat.dtype).conj()
         observed = (rows.unflatten(0, phases.shape[:2]) * phases[:, :, None]).transpose(1, 2)
-        of_scenes: Tensor = observed.unflatten(0, (self.num_scenes, -1))
-        return of_scenes
+        return observed.unflatten(0, (self.num_scenes, -1))
 
     def adjoint(self, spectra: Tensor, part: slice) -> Tensor:
         """``K^H W g``, (K, C, N, S), of the spectra (N, M, C, R, S) of rows at the frequencies ``part``."""
@@ -414,10 +392,9 @@ class Observation:
         rows = (spectra.flatten(0, 1) * phases[:, None]).transpose(1, 2).flatten(0, 1)
         # each row contributes to the scene rows of its taps
         total = rows.new_zeros(self.num_scenes * self.count, *rows.shape[1:])
-        for taps, kernel in self._smooth.taps(self.u[part], conjugate=True):
-            total = total.index_add_(0, self._places[taps].flatten(), (kernel[:, :, None] * rows).flatten(0, 1))
-        of_scenes: Tensor = total.unflatten(0, (self.num_scenes, -1)).movedim(0, 2)
-        return of_scenes
+        for places, kernel in self._taps(part, conjugate=True):
+            total = total.index_add_(0, places.flatten(), (kernel[:, :, None] * rows).flatten(0, 1))
+        return total.unflatten(0, (self.num_scenes, -1)).movedim(0, 2)
 
     def image(self, coefficients: Tensor) -> Tensor:
         """Rows of the scenes where the frame at rest would observe them, (N, C, R, L)."""
@@ -426,11 +403,9 @@ class Observation:
         weights = constant(np.array, (scene_weights(),), dtype=near.dtype.to_real(), device=near.device)
         sampled = correlated(torch.view_as_real(near).flatten(1), weights, 0)[0]
         spectra = torch.view_as_complex(sampled.unflatten(1, (*near.shape[1:], 2)))
-        scenes: Tensor = torch.fft.irfft(spectra.permute(2, 1, 0, 3), n=self.period)
-        return scenes
+        return torch.fft.irfft(spectra.permute(2, 1, 0, 3), n=self.period)
 
 
 def frequencies_of(period: int) -> Tensor:
     """Frequencies (U,) of rows of a period in cycles per px, on the CPU."""
-    frequencies: Tensor = torch.fft.rfftfreq(period, dtype=torch.float64, device="cpu")
-    return frequencies
+    return torch.fft.rfftfreq(period, dtype=torch.float64, device="cpu")

@@ -6,7 +6,6 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +16,7 @@ from torch.nn import functional
 from rsvib_torch.execution.chunking import at_once, runs
 from rsvib_torch.numerics.fourier import extend_rows, squared_modulus, waves
 from rsvib_torch.numerics.splines import mirrored
-from rsvib_torch.numerics.tables import Array, constant, tables
+from rsvib_torch.numerics.tables import Array, constant
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.scene_model.observation import kernel_spectrum
 
@@ -79,9 +78,6 @@ class RowPrior:
         return self.products() * ratio.maximum(lowest).clamp(max=1e3)
 
 
-Table = Any  # a tensor, or an array of NumPy: operators that both have
-
-
 def _mixing(count: int, weights: Sequence[float], fold: Callable[[Array], Array]) -> Array:
     """Matrix (U, U) of a weighted mean over neighbouring frequencies, whose indices are folded at both ends."""
     matrix = np.zeros((count, count))
@@ -95,12 +91,12 @@ def autoregressive_prior(observed: Tensor, transfer: Tensor, aliases: Tensor, no
 
     Each step computes the expected power spectrum of the scene for the current model, the sum of the squared Wiener
     estimate and of its variance, and fits the autoregressive model to it (Yule-Walker equations). ``observed`` (N, U,
-    V) is the power of the frames, horizontal frequencies by vertical ones, ``transfer`` that of the blur, and
-    ``noise_power`` that of the noise. ``aliases`` (N, T, U, V) is the power of the interpolation error of the kernel
-    between rows, through the blur of each frame, for a wave of power 1.
+    V) is the power of the frames, ``transfer`` that of the blur, and ``noise_power`` that of the noise. ``aliases`` (N,
+    T, U, V) is the power of the interpolation error of the kernel between rows, through the blur of each frame, for a
+    wave of power 1.
     """
     _, U, V = observed.shape
-    constants = (
+    matrices = (
         # cosines of the lags of autocovariances (V, p + 1), and the pooling of the lags over neighbouring frequencies
         np.cos(2 * np.pi * np.fft.fftfreq(V)[:, None] * np.arange(ORDER + 1)),
         _mixing(U, (0.25, 0.5, 0.25), lambda u: np.minimum(np.abs(u), 2 * (U - 1) - np.abs(u))) / V,
@@ -108,25 +104,7 @@ def autoregressive_prior(observed: Tensor, transfer: Tensor, aliases: Tensor, no
         _mixing(U, (0.2,) * 5, lambda u: u.clip(0, U - 1)),
         _mixing(V, (0.2,) * 5, lambda v: v % V),
     )
-    spectra, device = (observed, transfer, aliases, noise_power), observed.device
-    if torch.is_grad_enabled() and any(values.requires_grad for values in spectra):
-        of_tensors = [torch.as_tensor(constant, device=device) for constant in constants]
-        power, reflections, interpolation = _expectation_maximisation(spectra, of_tensors)
-        return RowPrior(power, torch.stack(reflections), interpolation)
-    # small tables, for which the calls of PyTorch would take longer than the arithmetic
-    power, reflections, interpolation = _expectation_maximisation(tables(*spectra), constants)
-    return RowPrior(*(torch.from_numpy(values).to(device) for values in (power, np.stack(reflections), interpolation)))
-
-
-def _expectation_maximisation(
-    spectra: Sequence[Table], constants: Sequence[Table], iterations: int = 20
-) -> tuple[Table, list[Table], Table]:
-    """Power (N, U), partial correlations, and interpolation power (N, T, U) of the scene; tensors or arrays.
-
-    The spectra are the arguments of ``autoregressive_prior``, which makes the constants.
-    """
-    observed, transfer, aliases, noise_power = spectra
-    cosine, pooling, around_u, around_v = constants
+    cosine, pooling, around_u, around_v = (torch.from_numpy(matrix).to(observed.device) for matrix in matrices)
     # steps are small where the noise is stronger than the scene: below half of the noise power, the initial value is
     # pooled over neighbouring frequencies, as that of a single one depends on chance
     excess, level = observed - noise_power, 0.5 * noise_power
@@ -134,7 +112,7 @@ def _expectation_maximisation(
     excess = excess + (excess < level) * (pooled - excess)
     scene = excess.clip(0.002 * noise_power, None) * transfer / (transfer * transfer + 1e-2)
     through = transfer * observed
-    for _ in range(iterations):
+    for _ in range(20):
         # the model of the expected spectrum of the scene: Levinson recursion for its autocovariances
         moments = pooling @ (scene @ cosine)
         power = moments[..., 0].clip(_TINY, None)
@@ -150,7 +128,7 @@ def _expectation_maximisation(
         gain = 1.0 / (penalty + transfer)
         scene = gain * noise_power + gain * gain * through
     interpolation = (scene[:, None] * aliases).mean(-1)
-    return power, [first, second], interpolation.clip(_TINY, None)
+    return RowPrior(power, torch.stack([first, second]), interpolation.clip(_TINY, None))
 
 
 def brightness(frames: Tensor) -> Tensor:
@@ -172,12 +150,6 @@ def cut_pieces(images: Tensor, tops: NDArray[np.int64], lefts: NDArray[np.int64]
     return images[..., rows[:, None, :, None], columns[None, :, None, :]]
 
 
-def power_transfer(displacement: Tensor, node_weights: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """Squared transfer functions (..., U, V) of exposures with displacement (..., N, 2) px, at frequencies u and v."""
-    along = waves(displacement[..., 0], u) * node_weights[:, None]
-    return squared_modulus(along.mT @ waves(displacement[..., 1], v))
-
-
 @dataclass(frozen=True, eq=False)
 class ObservedSpectrum:
     """Power spectra of pieces of the frames of N stacks, whose rows were moved back by their displacement."""
@@ -192,7 +164,8 @@ class ObservedSpectrum:
 
     def blur(self, u: Tensor, v: Tensor) -> Tensor:
         """Squared transfer functions (N, T, pieces, U, V) of the exposures at frequencies u and v."""
-        return power_transfer(self.displacement, self.node_weights, u, v)
+        along = waves(self.displacement[..., 0], u) * self.node_weights[:, None]
+        return squared_modulus(along.mT @ waves(self.displacement[..., 1], v))
 
     def weighted(self, transfer: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Observed power (N, U, V), weights (N, T, pieces, U, V) of sum 1, and power (N, U, V) of the noise.
@@ -251,10 +224,12 @@ def observed_spectrum(frames: Tensor, motion: FrameMotion, levels: Tensor, lengt
         spectra = torch.fft.rfft(pieces.sub_(bright[..., None]).mul_(tapers[1])).mul_(back[:, :, None, chosen, None])
         powers.append(squared_modulus(torch.fft.fft(spectra, dim=-2)).mean((2, 4)).transpose(-2, -1))
     power = torch.cat(powers, dim=2).to(torch.float64)
-    # power of a few strips of whole rows with their boundary extension
+    # Power of a few strips of whole rows with their boundary extension, pooled to the frequencies of the pieces. Rows
+    # are not moved back by their displacement: it does not matter at the low frequencies of the extension.
     few = np.rint(np.linspace(0, len(tops) - 1, min(4, len(tops)))).astype(np.int64)
-    strips_of_rows = (frames[..., rows[few], :] - bright) * tapers[0][:, None]  # (N, T, C, n, rows, W)
-    whole = _power_of_rows(strips_of_rows, length, len(u)) / length
+    strips = extend_rows((frames[..., rows[few], :] - bright) * tapers[0][:, None], length)  # (N, T, C, n, rows, L)
+    of_strips = squared_modulus(torch.fft.fft(torch.fft.rfft(strips), dim=-2)).mean((1, 2, 3))
+    whole = functional.adaptive_avg_pool1d(of_strips, len(u)).mT.to(torch.float64) / length
     # blur of the middle row of each piece
     return ObservedSpectrum(u, v, power, whole, displacement[:, :, rows[:, size[0] // 2]], node_weights, levels)
 
@@ -277,17 +252,5 @@ def fit_prior(frames: Tensor, motion: FrameMotion, levels: Tensor, length: int) 
 def smeared(transfer: Tensor) -> Tensor:
     """Transfer function (..., U, V) of tapered pieces: the taper mixes neighbouring frequencies."""
     count = transfer.shape[-2]
-    near = torch.arange(-1, count + 1, device=transfer.device)
-    wide = transfer[..., mirrored(near, count), :]
-    between = wide[..., :-2, :] + wide[..., 2:, :]
-    return (2.0 / 3.0) * transfer + (1.0 / 6.0) * between
-
-
-def _power_of_rows(strips: Tensor, length: int, count: int) -> Tensor:
-    """Power (N, U, V) of whole rows with their boundary extension, pooled to U frequencies along them.
-
-    The strips (N, T, C, n, R, W) are tapered across their rows. Rows are not moved back by their displacement: it does
-    not matter at the low frequencies of the extension.
-    """
-    power = squared_modulus(torch.fft.fft(torch.fft.rfft(extend_rows(strips, length)), dim=-2)).mean((1, 2, 3))
-    return functional.adaptive_avg_pool1d(power, count).mT.to(torch.float64)
+    wide = transfer[..., mirrored(torch.arange(-1, count + 1, device=transfer.device), count), :]
+    return (2.0 / 3.0) * transfer + (1.0 / 6.0) * (wide[..., :-2, :] + wide[..., 2:, :])

@@ -32,9 +32,9 @@ from rsvib_torch.restoration.noise import noise_deviation
 from rsvib_torch.restoration.verdict.pairs import (
     ComparedFrames,
     FramePairs,
-    Overlap,
     TooLittleInCommonError,
     equally_bright,
+    is_enough,
     misfit,
     overlaps,
     pairs_to_judge,
@@ -54,6 +54,9 @@ from rsvib_torch.results.reason import Reason
 _PARTLY_RESIDUAL = 0.35  # of the displacement between the raw frames; above, a part of the vibration was not undone
 _WORSE_RESIDUAL = 0.8  # of that displacement; above, the vibration was not undone
 _GAIN_ERROR = 2.0  # dB; error of the estimated gain, up to which its sign is not used
+_FINEST = 0.03  # px; misfit that is negligible in any image
+_CROSSTALK = 0.05  # error of a misfit along one axis, relative to the displacement along the other
+_MAX_MISSING = 0.5  # share of the pixels of a pair without data, above which it is not judged
 
 _STRIP = 160  # px, width of the strip of columns that is judged with roll or zoom: enough for the means of a pair
 _MIN_NOISE = 1e-5  # of full scale; noise level assumed at least, rounding of float32 images
@@ -68,52 +71,40 @@ def outcome_of_pair(
     gain: float,
     *,
     one_image: bool = False,
-    finest: float = 0.03,
-    crosstalk: float = 0.05,
 ) -> tuple[Outcome, tuple[Reason, ...]]:
     """Outcome of one pair, and the reasons for it; none if restoration helps.
 
-    Scores are the residual displacement relative to that of the raw frames, and the estimated gain. The gain decides
-    where the residual is small, because it is valid only where the motion is right.
-
-    Args:
-        before: Misfit of the raw frames (x, y) in px.
-        after: Residual misfit after restoration.
-        resolution: Misfits below which they cannot be distinguished from 0.
-        moves: Axes with motion in the vibration.
-        offset: Displacement between the frames that the vibration predicts, px.
-        gain: Estimated gain in dB.
-        one_image: Whether both frames were restored to one image, whose gain is not valid for a wrong motion.
-        finest: Misfit in px that is negligible in any image.
-        crosstalk: Error of ``after`` along one axis, relative to the displacement along the other.
+    Scores are the residual displacement relative to that of the raw frames, and the estimated gain in dB. The gain
+    decides where the residual is small, because it is valid only where the motion is right. ``before`` and ``after``
+    are the misfits (x, y) in px of the raw and of the restored frames, ``offset`` is what the vibration predicts for
+    the raw ones, and below the ``resolution`` a misfit cannot be distinguished from 0. ``moves`` are the axes with
+    motion. ``one_image`` states that both frames were restored to one image, whose gain is not valid for a wrong
+    motion.
     """
     outcomes: list[tuple[Outcome, Reason | None]] = []
     motion_is_complete = True
     for axis, name in enumerate("xy"):
-        least, size, rest = max(resolution[axis], finest), before[axis], after[axis]
+        least, size, rest = max(resolution[axis], _FINEST), before[axis], after[axis]
         if not moves[axis]:
             motion_is_complete &= size <= least
             continue
-        negligible = max(least, crosstalk * before[1 - axis])
+        negligible = max(least, _CROSSTALK * before[1 - axis])
         visible = max(size, offset[axis])
         details = {"before": size}
         if math.isinf(least):
             outcomes.append(("unknown", Reason("no_contrast", name)))
-        elif rest <= negligible:
-            is_visible = visible > least
-            outcomes.append(
-                ("helps", None) if is_visible else ("unknown", Reason("displaced_alike", name, visible, least))
-            )
+        elif rest <= negligible and visible <= least:
+            outcomes.append(("unknown", Reason("displaced_alike", name, visible, least)))
+        elif rest <= max(negligible, _PARTLY_RESIDUAL * size):
+            outcomes.append(("helps", None))
         elif rest > _WORSE_RESIDUAL * size:
             # less noise may outweigh a motion that was not undone, but not a motion that does not exist
             outweighed = size > least and gain > _GAIN_ERROR and not one_image
             remains = Reason("motion_remains", name, rest, max(_WORSE_RESIDUAL * size, negligible), details)
             outcomes.append(("partly" if outweighed else "worse", remains))
-        elif rest > _PARTLY_RESIDUAL * size:
+        else:
             remains = Reason("motion_remains", name, rest, max(_PARTLY_RESIDUAL * size, negligible), details)
             outcomes.append(("partly", remains))
-        else:
-            outcomes.append(("helps", None))
     if not outcomes:
         return "unknown", (Reason("nothing_undone"),)
     outcome = max((outcome for outcome, _ in outcomes), key=OUTCOMES.index)
@@ -131,9 +122,9 @@ def _mean_square(difference: Tensor) -> Tensor:
 
 
 def _judge_pairs(
-    pair: FramePairs, moves: list[list[bool]], shared: int, *, max_missing: float = 0.5
+    pair: FramePairs, moves: list[list[bool]], shared: int
 ) -> tuple[Array, Array, list[tuple[Outcome, tuple[Reason, ...]]]]:
-    """Verdict on one pair of each of B stacks, in row order; not judged if more than ``max_missing`` is missing.
+    """Verdict on one pair of each of B stacks, in row order.
 
     ``moves`` are the axes with motion of each stack, ``shared`` the frames from which one image is restored. The result
     is ``LEVELS`` (5, B), ``DISPLACEMENTS`` (3, B, 2), and the outcome of each stack with its reasons.
@@ -181,8 +172,8 @@ def _judge_pairs(
     for (*axes, level, share), moving in zip(figures.tolist(), moves, strict=True):
         outcome, why = outcome_of_pair(axes[:2], axes[2:4], axes[4:6], moving, axes[6:], level, one_image=one_image)
         contradicted.append((outcome == "worse" and level > 0) or (outcome in ("helps", "partly") and level < 0))
-        if share > max_missing:
-            outcome, why = "unknown", (Reason("pixels_missing", None, share, max_missing),)
+        if share > _MAX_MISSING:
+            outcome, why = "unknown", (Reason("pixels_missing", None, share, _MAX_MISSING),)
         outcomes.append((outcome, why))
     gain = np.where(contradicted, math.nan, gain)
     levels = np.stack([np.sqrt(before), np.sqrt(after), np.sqrt(noise), unexplained / noise, gain])
@@ -205,13 +196,11 @@ def judge_restoration(
 ) -> RestorationVerdict:
     """Judge whether restored frames are better than raw ones, without the true scene.
 
-    Three quantities are measured. Every restored frame, blurred by the motion of the next one, should equal that next
-    frame: a wrong vibration leaves a displacement between the two (``misfit_after``). Restored frames should agree
-    with each other better than raw frames do, noise and ringing included (``predicted_gain``). The residual should be
-    noise (``chi_square``).
-
-    A vibration that displaces all frames alike (at a blind frequency) is not visible in these quantities; the outcome
-    is then ``"unknown"``.
+    Every restored frame, blurred by the motion of the next one, should equal that next frame: a wrong vibration leaves
+    a displacement between the two (``misfit_after``). Restored frames should agree with each other better than raw
+    frames do, noise and ringing included (``predicted_gain``). The residual should be noise (``chi_square``). A
+    vibration that displaces all frames alike (at a blind frequency) is not visible in these quantities; the outcome is
+    then ``"unknown"``.
 
     Args:
         frames: Raw stack (T, H, W) or (T, C, H, W), at least two frames.
@@ -240,8 +229,7 @@ def judge_restoration(
         >>> wrong = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[3.6, 4.1])  # opposite phase
         >>> for candidate in (vibration, wrong):
         ...     restored = rsv.restore(frames, timing, candidate, check=False)
-        ...     verdict = rsv.judge_restoration(frames, restored, timing, candidate)
-        ...     print(verdict.outcome)
+        ...     print(rsv.judge_restoration(frames, restored, timing, candidate).outcome)
         ('helps',)
         ('worse',)
     """
@@ -376,34 +364,29 @@ def _judge_batch(
     """Verdicts on all stacks of a batch, whose displacement depends on the row only.
 
     The ``pairs`` are counted among the frames that are compared, which have ``numbers`` in the stack. One image is
-    restored from ``shared`` frames. The timing is in image orientation; ``columns`` as in ``judge_stacks``.
+    restored from ``shared`` frames. The timing is in image orientation.
     """
     # What the frames of each pair have in common. Stacks with too little are not judged; stacks whose parts of one size
     # would be too small are judged one by one.
-    size = frames.raw.shape[-2], frames.raw.shape[-1]
-    common = overlaps(frames, pairs)
-    small = [[not overlap.is_enough(size) for overlap in of_stack] for of_stack in common]
-    smallest = [Overlap.of_all([of_stack[pair] for of_stack in common]) for pair in range(len(pairs))]
-    if not all(one.is_enough(size) for one in smallest):
+    size = frames.raw.shape[-2:]
+    steps, rims = overlaps(frames, pairs)
+    if not is_enough(size, abs(steps).max(0), rims.max(0)).all():
         results: list[RestorationVerdict | TooLittleInCommonError] = []
-        for stack, of_stack in enumerate(common):
-            if any(small[stack]):
-                place = small[stack].index(True)
-                (y, x), (earlier, later) = of_stack[place].step, (numbers[frame] for frame in pairs[place])
-                apart = f"they lie ({x}, {y}) px apart"
-                results.append(
-                    TooLittleInCommonError(
-                        f"frames {earlier} and {later} have nothing in common, or too little: {apart}"
-                    )
-                )
-            else:
+        for stack, enough in enumerate(is_enough(size, steps, rims)):
+            if enough.all():
                 alone = frames.of([stack])
                 results += _judge_batch(alone, [moves[stack]], pairs, numbers, shared, columns, timing)
+                continue
+            place = int(enough.argmin())
+            (y, x), (earlier, later) = steps[stack, place], (numbers[frame] for frame in pairs[place])
+            apart = f"they lie ({x}, {y}) px apart"
+            message = f"frames {earlier} and {later} have nothing in common, or too little: {apart}"
+            results.append(TooLittleInCommonError(message))
         return results
 
     # The verdict on each pair of frames, of all stacks.
     verdicts = [
-        _judge_pairs(shared_part(frames, pair, [of_stack[number] for of_stack in common], columns), moves, shared)
+        _judge_pairs(shared_part(frames, pair, steps[:, number], rims[:, number], columns), moves, shared)
         for number, pair in enumerate(pairs)
     ]
 
@@ -420,5 +403,5 @@ def _judge_batch(
             outcome=tuple(outcomes[stack][0] for *_, outcomes in verdicts),
             findings=tuple(reasons_from_row_order(outcomes[stack][1], timing) for *_, outcomes in verdicts),
         )
-        for stack in range(len(common))
+        for stack in range(len(moves))
     ]

@@ -6,6 +6,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -29,30 +30,6 @@ _MARGIN = 4  # px between the compared pixels and those outside the frame
 
 class TooLittleInCommonError(ValueError):
     """Two frames share too little of the scene to be compared."""
-
-
-@dataclass(frozen=True)
-class Overlap:
-    """What two frames of a stack have in common, in whole px along (rows, columns)."""
-
-    # displacement of the content from the earlier to the later frame, beyond the displacement of single rows
-    step: tuple[int, int]
-    # displacement of single rows, with a margin: so much at the ends of the common part is not compared
-    rim: tuple[int, int]
-
-    @classmethod
-    def of_all(cls, common: list["Overlap"]) -> "Overlap":
-        """The smallest common part of several pairs of frames, of which rims are compared nowhere."""
-        steps, rims = ([tuple(map(abs, one.step)) for one in common], [one.rim for one in common])
-        return cls(tuple(map(max, *steps, steps[0])), tuple(map(max, *rims, rims[0])))
-
-    def size(self, frame: tuple[int, int]) -> tuple[int, int]:
-        """Rows and columns of the common part of frames of (rows, columns)."""
-        return frame[0] - abs(self.step[0]), frame[1] - abs(self.step[1])
-
-    def is_enough(self, frame: tuple[int, int]) -> bool:
-        """Whether the common part is larger than the filters."""
-        return all(size - 2 * rim >= 2 * _RIM + 3 for size, rim in zip(self.size(frame), self.rim, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,44 +82,41 @@ def pairs_to_judge(count: int, joint: bool | int, most: int | None = None) -> li
         pairs = [(middle, p) for p in range(count) if p != middle]
     if most is None or len(pairs) <= most:
         return pairs
-    chosen = torch.linspace(0, len(pairs) - 1, most, dtype=torch.float32, device="cpu").round().to(torch.int64).tolist()
-    return [pairs[index] for index in chosen]
+    return [pairs[index] for index in np.rint(np.linspace(0, len(pairs) - 1, most)).astype(int)]
 
 
-def overlaps(frames: ComparedFrames, pairs: list[tuple[int, int]]) -> list[list[Overlap]]:
-    """What the frames of each pair have in common, for each of B stacks."""
-    # one transfer for all stacks and pairs
-    shifts, reaches = torch.stack([frames.motion.shift, frames.moved.abs().amax(-2)]).flip(-1).tolist()
-    found = []
-    for shift, reach in zip(shifts, reaches, strict=True):
-        of_stack = []
-        for earlier, later in pairs:
-            (y, x), (above, beside) = (
-                [operation(a, b) for a, b in zip(values[earlier], values[later], strict=True)]
-                for values, operation in ((shift, lambda a, b: int(b - a)), (reach, max))
-            )
-            of_stack.append(Overlap((y, x), (math.ceil(above) + _MARGIN, math.ceil(beside) + _MARGIN)))
-        found.append(of_stack)
-    return found
+def overlaps(frames: ComparedFrames, pairs: list[tuple[int, int]]) -> tuple[Array, Array]:
+    """Steps and rims (B, P, 2) of P pairs of frames of B stacks, in whole px along (rows, columns).
+
+    The step is the displacement of the content from the earlier to the later frame, beyond that of single rows. The rim
+    is the displacement of single rows, with a margin: so much at the ends of the common part is not compared.
+    """
+    earlier, later = np.array(pairs).T
+    shift, reach = table(torch.stack([frames.motion.shift, frames.moved.abs().amax(-2)]).flip(-1))
+    rims = np.ceil(np.maximum(reach[:, earlier], reach[:, later])).astype(np.int64) + _MARGIN
+    return (shift[:, later] - shift[:, earlier]).astype(np.int64), rims
+
+
+def is_enough(size: Sequence[int], steps: Array, rims: Array) -> Array:
+    """Whether the common part of frames of ``size`` (rows, columns) is larger than the filters."""
+    return (np.array(size) - abs(steps) - 2 * rims >= 2 * _RIM + 3).all(-1)
 
 
 def shared_part(
-    frames: ComparedFrames, pair: tuple[int, int], common: list[Overlap], columns: int | None
+    frames: ComparedFrames, pair: tuple[int, int], steps: Array, rims: Array, columns: int | None
 ) -> FramePairs:
     """Cut a ``pair`` of frames (indices) of each stack to their common part; rows are those of the later one.
 
-    What they have in ``common`` is from ``overlaps``. Of the columns, those with the most detail are kept; None for
-    all.
+    Steps and rims (B, 2) of the pair are from ``overlaps``. Of the columns, those with the most detail are kept; None
+    for all.
     """
     raw, restored, ignore, motion, moved = frames.raw, frames.restored, frames.ignore, frames.motion, frames.moved
     earlier, later = pair
     # the largest displacement of all stacks determines the size of the part
-    size = raw.shape[-2], raw.shape[-1]
-    of_all = Overlap.of_all(common)
-    (height, width), (rim_y, rim_x) = of_all.size(size), of_all.rim
-    steps = list(zip(*(one.step for one in common), strict=True))
-    tops, lefts = ([max(-step, 0) for step in along] for along in steps)
-    later_tops, later_lefts = ([max(step, 0) for step in along] for along in steps)
+    height, width = (np.array(raw.shape[-2:]) - abs(steps).max(0)).tolist()
+    rim_y, rim_x = rims.max(0).tolist()
+    tops, lefts = (-steps).clip(0).T.tolist()
+    later_tops, later_lefts = steps.clip(0).T.tolist()
     if columns is not None:
         second = cut_parts(raw[:, later], later_tops, later_lefts, (height, width))
         detailed = detailed_parts(second[:, None, ..., rim_x : width - rim_x], columns)
@@ -183,13 +157,13 @@ def shared_part(
     )
 
 
-def equally_bright(pair: FramePairs, noise: Array, *, block: int = 16) -> FramePairs:
+def equally_bright(pair: FramePairs, noise: Array) -> FramePairs:
     """The pairs with the earlier frame, and the images made of it, at the brightness and contrast of the later one.
 
-    Gain and offset are the regression of the later frame on the predicted one, from means over squares of ``block`` px,
-    which are large beside residual displacements. The noise power ``noise`` (B,) draws the gain towards 1.
+    Gain and offset are the regression of the later frame on the predicted one, from means over squares of 16 px, which
+    are large beside residual displacements. The noise power ``noise`` (B,) draws the gain towards 1.
     """
-    side = min(block, *pair.later.shape[-2:])
+    side = min(16, *pair.later.shape[-2:])
     images = torch.stack([pair.predicted, pair.later])
     means = table(functional.avg_pool2d(images.flatten(0, 2)[:, None], side)).astype(np.float64)
     means = means.reshape(*images.shape[:3], -1)
@@ -197,35 +171,26 @@ def equally_bright(pair: FramePairs, noise: Array, *, block: int = 16) -> FrameP
     predicted, later = means - levels[..., None]
     slope = ((predicted * later).mean((1, 2)) + noise) / (np.square(predicted).mean((1, 2)) + noise)
     # frames that contradict each other keep their brightness
-    related = slope[:, None] > 0.0
-    factors = np.concatenate(
-        [np.where(related, slope[:, None], 1.0), np.where(related, target - slope[:, None] * mean, 0.0)], 1
-    )
+    related, slope = slope[:, None] > 0.0, slope[:, None]
+    factors = np.hstack([np.where(related, slope, 1.0), np.where(related, target - slope * mean, 0.0)])
     of_images = torch.as_tensor(factors[..., None, None], dtype=images.dtype, device=images.device)
     gain, offset = of_images[:, :1], of_images[:, 1:]
 
-    def adjusted(image: Tensor) -> Tensor:
-        return torch.addcmul(offset, image, gain)
-
-    return replace(
-        pair,
-        earlier=adjusted(pair.earlier),
-        restored=adjusted(pair.restored),
-        predicted=adjusted(pair.predicted),
-        changed_later=gain * pair.changed_later if pair.restored_later is None else pair.changed_later,
-    )
+    adjusted = {name: torch.addcmul(offset, getattr(pair, name), gain) for name in ("earlier", "restored", "predicted")}
+    changed = gain * pair.changed_later if pair.restored_later is None else pair.changed_later
+    return replace(pair, **adjusted, changed_later=changed)
 
 
-def misfit(first: Tensor, second: Tensor, *, step: int = 4) -> tuple[Array, Array]:
+def misfit(first: Tensor, second: Tensor) -> tuple[Array, Array]:
     """Root-mean-square displacement between two images (..., C, H, W) of one scene along each axis, and its resolution.
 
     A displacement d changes brightness by ``d . grad f``, so that the mean squared difference is ``a + dx^2 fx^2 + dy^2
     fy^2 + 2 dx dy fx fy``; white noise raises ``a`` only. Both images are smoothed, so that this holds for
-    displacements up to about 10 px, and weighted least squares gives the means of dx^2 and dy^2 from places that are
-    ``step`` px apart: neighbours are nearly equal. Images have at least 35 px on a side. The results (..., 2) are in
-    px, axes (x, y), float64; a misfit below the resolution cannot be distinguished from zero. They are 0 and infinity
-    for images without contrast.
+    displacements up to about 10 px, and weighted least squares gives the means of dx^2 and dy^2. Images have at least
+    35 px on a side. The results (..., 2) are in px, axes (x, y), float64; a misfit below the resolution cannot be
+    distinguished from zero. They are 0 and infinity for images without contrast.
     """
+    step = 4  # px between the places that are used, as neighbours are nearly equal
     # Gaussian and its derivative; gradients of the mean image, and the smoothed difference
     place = np.arange(-_RIM, _RIM + 1)
     gaussian = np.where(abs(place) < _RIM, np.exp(-0.5 * (place / _SMOOTHING) ** 2), 0.0)
@@ -249,8 +214,7 @@ def misfit(first: Tensor, second: Tensor, *, step: int = 4) -> tuple[Array, Arra
     products, strongest, brightest = tables(
         torch.bmm(weighted.flatten(0, -3), data.flatten(0, -3).mT), energy.amax(-1), largest
     )
-    products = products.reshape(*strongest.shape, *products.shape[1:])
-    normal, right, scatter = products[..., :4], products[..., 4:5], products[..., 5:]
+    normal, right, scatter = np.split(products.reshape(*strongest.shape, *products.shape[1:]), (4, 5), -1)
     # small tables on the CPU; those of images without contrast may overflow
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         scale = np.maximum(np.diagonal(normal, axis1=-2, axis2=-1), tiny) ** -0.5
@@ -267,15 +231,15 @@ def misfit(first: Tensor, second: Tensor, *, step: int = 4) -> tuple[Array, Arra
     return np.where(has_contrast, size, 0.0), np.where(has_contrast, resolution, math.inf)
 
 
-def reblur(scenes: Tensor, motion: FrameMotion, frame: int, first_rows: list[int], *, degree: int = 5) -> Tensor:
+def reblur(scenes: Tensor, motion: FrameMotion, frame: int, first_rows: list[int]) -> Tensor:
     """Form one frame of each stack from restored scenes (Eq. 9), independently of the restoration method.
 
-    Displacement along rows is a phase ramp, across rows a B-spline, the exposure a Gauss-Legendre sum. The scenes (B,
-    C, H, W) are in row order, in the coordinates in which frame ``frame`` is restored; they may be a part of the rows
-    and columns, and are mirrored beyond. Row 0 of a scene is at its row of ``first_rows`` of the frame.
+    The scenes (B, C, H, W) are in row order, in the coordinates in which frame ``frame`` is restored; they may be a
+    part of the rows and columns, and are mirrored beyond. Row 0 of a scene is at its row of ``first_rows`` of the
+    frame.
     """
     # displacement of each row during its exposure
-    count, (height, width) = len(scenes), scenes.shape[-2:]
+    degree, count, (height, width) = 5, len(scenes), scenes.shape[-2:]
     rows, stacks = torch.arange(height, device=scenes.device), torch.arange(count, device=scenes.device)
     first = torch.tensor(first_rows, device=scenes.device)[:, None]
     displacement, node_weights = motion.exposures

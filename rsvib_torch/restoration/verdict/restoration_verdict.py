@@ -45,15 +45,6 @@ class RestorationVerdict(
             ``"worse"``; ``"unknown"``: cannot be determined from this pair (vibration too small, or at a blind
             frequency; frames without contrast; too many missing pixels).
         findings: The ``Reason`` objects of each pair; none where restoration helps. ``reasons`` has their texts.
-
-    Example:
-        >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.datasets import example_frames
-        >>> frames, timing, vibration = example_frames()
-        >>> restored = rsv.restore(frames, timing, vibration, check=False)
-        >>> verdict = rsv.judge_restoration(frames, restored, timing, vibration)
-        >>> verdict.outcome, bool(verdict.misfit_after.max() < 0.01)  # px
-        (('helps',), True)
     """
 
     before: Tensor

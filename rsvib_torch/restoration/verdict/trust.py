@@ -21,20 +21,13 @@ def displacement_uncertainty(
     """Root-mean-square error of the displacement of the rows by standard deviations, and the displacement itself.
 
     If ``std.displacement`` is given, it is the error; it contains the image motion and all correlations. Otherwise, for
-    ``A sinc(f T_e) sin(2 pi f t + phi)``, the variance of a tone averaged over its period is
-    ``sinc^2 (std_A^2 + A^2 std_angle^2) / 2``. The phase at the time origin and the frequency are correlated: the angle
-    is most accurate in the middle of the record. Its variance there, plus the variance by the frequency with the mean
-    squared distance from the middle, is ``std_angle^2``.
+    ``A sinc(f T_e) sin(2 pi f t + phi)``, the variance of a tone averaged over its period is ``sinc^2 (std_A^2 + A^2
+    std_angle^2) / 2``. The phase at the time origin and the frequency are correlated: the angle is most accurate in the
+    middle of the record. Its variance there, plus the variance by the frequency with the mean squared distance from the
+    middle, is ``std_angle^2``.
 
-    Args:
-        vibration: The detected vibration, batch shape () or (B,).
-        std: Its standard deviations.
-        timing: The sensor.
-        num_frames: Frames of the stack.
-        num_rows: Rows of a frame, along the scan axis.
-
-    Returns:
-        Uncertainty and displacement (..., 2) in px, axes (x, y), float64; image motion is not part of either.
+    The vibration has the batch shape () or (B,). Uncertainty and displacement (..., 2) are in px, axes (x, y), float64;
+    image motion is not part of either.
     """
     starts = timing.frame_starts(num_frames)
     first, last = float(starts[0]), float(starts[-1]) + num_rows * timing.row_time
