@@ -232,13 +232,7 @@ def test_half_precision_is_accurate_to_its_quantisation(grey):
     assert found.vibration.amplitude.dtype == torch.float64
 
 
-@pytest.mark.parametrize(
-    ("shape", "order"),
-    [
-        ((48, 64, 3, 10), (3, 2, 0, 1)),
-        ((2, 3, 10, 48, 64), (0, 2, 1, 3, 4)),
-    ],
-)
+@pytest.mark.parametrize(("shape", "order"), [((48, 64, 3, 10), (3, 2, 0, 1)), ((2, 3, 10, 48, 64), (0, 2, 1, 3, 4))])
 def test_frames_on_another_axis_are_refused_with_the_order_of_the_axes(shape, order):
     frames = torch.zeros(shape)
     refuses(lambda: rsv.restore(frames, TIMING, VIBRATION), rf"frames.permute{re.escape(str(order))}")

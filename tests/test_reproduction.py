@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 from benchmark_options import defaults
 from benchmarks import reproduction
-from benchmarks.reproduction import (
-    AMPLITUDE,
-    DETECTED,
-    PERIOD,
-    RESTORED,
-    crossing,
-    straight_edge_mtf,
-)
+from benchmarks.reproduction import AMPLITUDE, DETECTED, PERIOD, RESTORED, crossing, straight_edge_mtf
 from edge_truth import draw_edge, gaussian, through_pixels
 
 

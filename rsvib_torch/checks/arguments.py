@@ -11,13 +11,13 @@ import operator
 import os
 import types
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from functools import cache, reduce, wraps
 from typing import Annotated, Any, ParamSpec, Self, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 import torch
-from pydantic import ConfigDict, Field, Strict, TypeAdapter
+from pydantic import ConfigDict, Field, GetPydanticSchema, Strict, TypeAdapter
 from pydantic_core import core_schema
 from torch import Tensor
 
@@ -245,20 +245,11 @@ def _bounded(kind: Any, finite: bool) -> Any:  # noqa: PLR0911
     if get_origin(kind) in (os.PathLike, np.ndarray) or (
         isinstance(kind, type) and kind not in _PLAIN and get_origin(kind) is None
     ):
-        return Annotated[Any, _Instance(get_origin(kind) or kind)]
+        of_class = core_schema.is_instance_schema(get_origin(kind) or kind)  # pydantic checks only the class
+        return Annotated[Any, GetPydanticSchema(lambda source, handler: of_class)]
     arguments: Any = tuple(argument if argument is ... else _bounded(argument, finite) for argument in get_args(kind))
     if get_origin(kind) is tuple:
         return Annotated[tuple.__class_getitem__(arguments), Strict(False)]
     if get_origin(kind) in (Union, types.UnionType):
         return reduce(operator.or_, arguments)
     return get_origin(kind)[arguments] if get_origin(kind) in (Sequence, Mapping, list, dict) else kind
-
-
-@dataclass(frozen=True)
-class _Instance:
-    """Mark of an annotation of which pydantic checks only the class."""
-
-    kind: type
-
-    def __get_pydantic_core_schema__(self, source: object, handler: object) -> core_schema.CoreSchema:
-        return core_schema.is_instance_schema(self.kind)

@@ -28,7 +28,12 @@ def as_tensor(name: str, value: object) -> Tensor:
     if isinstance(value, np.ma.MaskedArray):
         raise TypeError(f"{name} must not be a masked array; pass its data, and the mask as ignore=")
     if isinstance(value, (list, tuple)) and any(isinstance(item, (list, tuple)) or _is_array(item) for item in value):
-        return _stacked(name, [as_tensor(f"{name}[{index}]", item) for index, item in enumerate(value)])
+        items = [as_tensor(f"{name}[{index}]", item) for index, item in enumerate(value)]
+        kinds = [f"{tuple(item.shape)} {str(item.dtype).removeprefix('torch.')} on {item.device}" for item in items]
+        for index, kind in enumerate(kinds):
+            if kind != kinds[0]:
+                raise ValueError(f"{name} must be alike, but {name}[{index}] is {kind} and {name}[0] is {kinds[0]}")
+        return torch.stack(items)
     try:
         if _is_array(value):
             array = np.asarray(value)
@@ -38,8 +43,8 @@ def as_tensor(name: str, value: object) -> Tensor:
         return check_tensor(name, torch.as_tensor(value, device="cpu"))
     except (TypeError, ValueError, RuntimeError) as error:
         kind = f" of {value.dtype}" if isinstance(value, np.ndarray) else ""
-        items = value if isinstance(value, (list, tuple)) else [value]
-        files = any(isinstance(item, (str, os.PathLike)) for item in items)
+        parts = value if isinstance(value, (list, tuple)) else [value]
+        files = any(isinstance(part, (str, os.PathLike)) for part in parts)
         remedy = "; read files with read_stack" if files else "; pass a list" if isinstance(value, Iterator) else ""
         got = f"{type(value).__name__}{kind}{remedy}"
         raise TypeError(f"{name} must be a tensor or array of numbers, got {got}") from error
@@ -48,14 +53,6 @@ def as_tensor(name: str, value: object) -> Tensor:
 def _is_array(value: object) -> bool:
     """Whether NumPy can convert the value without interpreting its elements: arrays, data sets of files, images."""
     return hasattr(value, "__array__") or hasattr(value, "__array_interface__")
-
-
-def _stacked(name: str, items: Sequence[Tensor]) -> Tensor:
-    kinds = [f"{tuple(item.shape)} {str(item.dtype).removeprefix('torch.')} on {item.device}" for item in items]
-    for index, kind in enumerate(kinds):
-        if kind != kinds[0]:
-            raise ValueError(f"{name} must be alike, but {name}[{index}] is {kind} and {name}[0] is {kinds[0]}")
-    return torch.stack(list(items))
 
 
 def channels_appear_last(shape: Sequence[int]) -> bool:

@@ -153,12 +153,6 @@ def page_step(frames: Path, out: Path, settings: Config, *more: str | Path) -> s
     return next_step(sentence, "report", frames, out, *settings.arguments, *more)
 
 
-def step_parts(step: str) -> tuple[str, str]:
-    r"""Sentence and command of a step; the command is empty if there is none."""
-    sentence, _, command = step.partition("\n")
-    return f"{sentence[0].upper()}{sentence[1:]}{'' if command else '.'}", command.strip()
-
-
 # Files in a folder
 
 OF_DETECTION = ("vibration.json", "tones.csv", "offsets.csv", "offsets.png", "spectrum.csv", "spectrum.png")

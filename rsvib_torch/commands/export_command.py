@@ -71,23 +71,17 @@ def export(given: ExportOptions) -> Answer:
     timing = detected.timing
     if timing is None:
         raise ValueError(f"{given.vibration}: the timing of the sensor is missing; detect the vibration again")
-    shape, count = _extent(given)
+    shape = None if given.size is None else size_of(given.size, "HEIGHTxWIDTH in px such as 1080x1920")
+    count = given.num_frames
+    if given.frames is not None:
+        of_stack = io.read_stack_info(given.frames).shape
+        shape, count = shape or (of_stack[-2], of_stack[-1]), of_stack[0] if count is None else count
+    if shape is None or count is None:
+        raise ValueError("size and number of the frames are not known: give --frames, or --size and --num-frames")
     motion = _trusted(given, detected, timing, count, shape[int(timing.scan_axis)])
     exports.write_gcsv(out, motion, timing, shape, count, sample_rate=given.sample_rate)
     text = f"of {count} frames, on the clock of the first row of frame 0"
     return Answer({"Angular rates": [text]}, {"format": chosen, "size": list(shape), "num_frames": count}, [out])
-
-
-def _extent(given: ExportOptions) -> tuple[tuple[int, int], int]:
-    """Size and number of the frames, from the stack or the options."""
-    size = None if given.size is None else size_of(given.size, "HEIGHTxWIDTH in px such as 1080x1920")
-    count = given.num_frames
-    if given.frames is not None:
-        shape = io.read_stack_info(given.frames).shape
-        size, count = size or (shape[-2], shape[-1]), shape[0] if count is None else count
-    if size is None or count is None:
-        raise ValueError("size and number of the frames are not known: give --frames, or --size and --num-frames")
-    return size, count
 
 
 def _trusted(

@@ -41,8 +41,7 @@ class InitOptions:
     out: Path = Path("camera.toml")
     """Configuration file to write."""
     sensor: Annotated[
-        Table,
-        Given(SensorSection, forms={**SENSOR_FORMS, "full_scale": {"show_default": "from the file"}}),
+        Table, Given(SensorSection, forms={**SENSOR_FORMS, "full_scale": {"show_default": "from the file"}})
     ]
     camera: str | None = None
     """Model of the camera, for its measured row time (rsvib cameras lists them)."""

@@ -349,7 +349,7 @@ def report(given: ReportOptions) -> Answer:
         verdict=result.verdict,
         left_alone=result.left_alone,
         options=options,
-        next_steps=tuple(answers.step_parts(step) for step in steps),
+        next_steps=tuple(steps),
     )
 
 

@@ -23,14 +23,9 @@ _BACKENDS: Any = torch.backends  # their attributes are not typed
 @contextmanager
 def _products_of_float32() -> Iterator[None]:
     """Products and convolutions of float32 use float32, not TF32 or bfloat16."""
+    cudnn, mkldnn = _BACKENDS.cudnn, _BACKENDS.mkldnn
     # those of cuDNN's recurrent networks are set together with its convolutions under one name
-    kinds = (
-        _BACKENDS.cuda.matmul,
-        _BACKENDS.cudnn.conv,
-        _BACKENDS.cudnn.rnn,
-        _BACKENDS.mkldnn.matmul,
-        _BACKENDS.mkldnn.conv,
-    )
+    kinds = (_BACKENDS.cuda.matmul, cudnn.conv, cudnn.rnn, mkldnn.matmul, mkldnn.conv)
     previous = [kind.fp32_precision for kind in kinds]
     for kind in kinds:
         kind.fp32_precision = "ieee"

@@ -115,7 +115,7 @@ def temporary_folder(path: Path) -> Iterator[Path]:
             raise OSError(number, os.strerror(number), str(path)) from error
 
 
-def check_not_special(path: str | os.PathLike[str]) -> None:
+def check_not_special(path: _Path) -> None:
     """Raise an ``OSError`` if a path exists and is neither a regular file nor a folder: it would be replaced by one."""
     if os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path):
         raise FileExistsError(f"cannot write {os.fspath(path)}: it is a device, pipe or socket; choose another name")
@@ -141,12 +141,6 @@ def check_target(path: Path, kind: Kind = "file", *, parent_exists: bool = True)
         raise PermissionError(f"cannot write into folder {path}: it is not writable")
 
 
-def check_tree(path: Path, marker: str, what: str) -> None:
-    """Raise a ``FileExistsError`` unless ``path``, which is replaced with all its files, has the file ``marker``."""
-    if path.exists() and not (path / marker).is_file():
-        raise FileExistsError(f"cannot write {path}: it exists and is not a {what}; choose another name")
-
-
 def check_writable(path: Path, *, folder: bool = False) -> None:
     """Raise an ``OSError`` with the reason if ``path`` cannot be written; creates nothing."""
     check_target(path, "folder" if folder else "file")
@@ -155,7 +149,7 @@ def check_writable(path: Path, *, folder: bool = False) -> None:
 
 
 @contextmanager
-def whole(path: str | os.PathLike[str], kind: Kind = "file", companions: tuple[str, ...] = ()) -> Iterator[Path]:
+def whole(path: _Path, kind: Kind = "file", companions: tuple[str, ...] = ()) -> Iterator[Path]:
     """Write a file or folder under a temporary name; it gets its name when the block ends without an exception.
 
     It is on the disk then. The folders above it are created. An existing file or tree is replaced; an existing folder
@@ -189,7 +183,7 @@ def whole(path: str | os.PathLike[str], kind: Kind = "file", companions: tuple[s
 
 
 @contextmanager
-def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
+def whole_file(path: _Path) -> Iterator[Path]:
     """``whole`` for a file in a folder that must exist."""
     check_target(Path(path))
     with whole(path) as part:
@@ -197,14 +191,14 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 @contextmanager
-def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+def whole_folder(path: _Path) -> Iterator[Path]:
     """``whole`` for a folder, which is created."""
     with whole(path, "folder") as part:
         part.mkdir()
         yield part
 
 
-def write_json(path: str | os.PathLike[str], content: Mapping[str, object]) -> None:
+def write_json(path: _Path, content: Mapping[str, object]) -> None:
     """Write a table as JSON with one key per line, atomically."""
     with whole_file(path) as part:
         part.write_text(json_text(content) + "\n", encoding="utf-8")

@@ -1,6 +1,8 @@
 """Grey frames in row order, as every detection and alignment uses them."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,6 +15,7 @@ from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import MaskedInputOptions
 
+_LEAST_VALID = 0.1  # of the pixels of a frame
 # of the 3 x 3 pixels around a missing one that counts as measured: at the straight edge of a hole, 0.67 are
 _MEASURED_AROUND = 0.7
 
@@ -27,53 +30,45 @@ class GreyFrames:
     # the sensor in image orientation, with the frame times of the file if frames were given by a path
     timing: SensorTiming
 
+    def _changed(self, change: Callable[[Tensor], Tensor], **stated: Any) -> "GreyFrames":
+        """The stacks with a change of images and mask, and other values of further fields."""
+        valid = None if self.valid is None else _unless_complete(change(self.valid))
+        return replace(self, images=change(self.images), valid=valid, **stated)
+
     def narrowed(self, columns: int) -> "GreyFrames":
         """The given number of neighbouring columns of each stack, those with the most detail."""
         if columns >= self.images.shape[-1]:
             return self
         parts = detailed_parts(self.images, columns)
-        valid = None if self.valid is None else cut_columns(self.valid, parts)
-        return replace(self, images=cut_columns(self.images, parts), valid=_unless_complete(valid))
+        return self._changed(lambda values: cut_columns(values, parts))
 
     def columns(self, part: slice) -> "GreyFrames":
         """Some neighbouring columns of each stack."""
-        valid = None if self.valid is None else self.valid[..., part]
-        return replace(self, images=self.images[..., part], valid=_unless_complete(valid))
+        return self._changed(lambda values: values[..., part])
 
     def one(self, index: int) -> "GreyFrames":
         """One stack out of the batch, as a batch of one."""
-        part = slice(index, index + 1)
-        valid = None if self.valid is None else self.valid[part]
-        return replace(self, images=self.images[part], valid=_unless_complete(valid), batched=False)
+        return self._changed(lambda values: values[index : index + 1], batched=False)
 
     def with_timing(self, timing: SensorTiming) -> "GreyFrames":
         """The same stacks in the row order of another timing."""
-
-        def turned(values: Tensor) -> Tensor:
-            return frames_to_row_order(frames_from_row_order(values, self.timing), timing)
-
-        valid = None if self.valid is None else turned(self.valid)
-        return replace(self, images=turned(self.images), valid=valid, timing=timing)
+        return self._changed(
+            lambda values: frames_to_row_order(frames_from_row_order(values, self.timing), timing), timing=timing
+        )
 
 
-def _unless_complete(valid: Tensor | None) -> Tensor | None:
+def _unless_complete(valid: Tensor) -> Tensor | None:
     """The mask of valid pixels; None if all are valid."""
-    return None if valid is None or bool(valid.all()) else valid
+    return None if bool(valid.all()) else valid
 
 
 def grey_frames(
-    frames: FramesOrFiles,
-    timing: SensorTiming,
-    given: MaskedInputOptions,
-    *,
-    min_valid_fraction: float = 0.1,
-    timed: bool = True,
+    frames: FramesOrFiles, timing: SensorTiming, given: MaskedInputOptions, *, timed: bool = True
 ) -> GreyFrames:
     """Read and check stacks of frames as ``prepare_frames`` does, and convert them to grey frames in row order.
 
     There must be at least two frames. Frames that are constant, have too few pixels that are not missing, or are copies
-    of the one before are refused.
-    ``timed``: whether the sensor has the times of the frames; False where they are looked for.
+    of the one before are refused. ``timed``: whether the sensor has the times of the frames, or they are looked for.
     """
     prepared = prepare_frames(
         frames, timing, full_scale=given.full_scale, channels=given.channels, ignore=given.ignore, minimum_frames=2
@@ -89,11 +84,12 @@ def grey_frames(
     if prepared.missing is not None:
         valid = ~prepared.missing.any(2)
         fraction = valid.float().mean((-2, -1))
-        if bool((fraction < min_valid_fraction).any()):
-            stack, frame = (fraction < min_valid_fraction).nonzero()[0].tolist()
+        small = (fraction < _LEAST_VALID).nonzero()
+        if len(small):
+            stack, frame = small[0].tolist()
             raise ValueError(
                 f"frame {frame}{of_stack(stack)} has only {fraction[stack, frame]:.1%} of pixels with data, "
-                f"{min_valid_fraction:.0%} are needed; mark fewer pixels by NaN or ignore"
+                f"{_LEAST_VALID:.0%} are needed; mark fewer pixels by NaN or ignore"
             )
         # single pixels are interpolated: the rows of a frame without one pixel in twenty could not be registered
         around = torch.nn.functional.avg_pool2d(valid.to(images.dtype), 3, 1, 1)

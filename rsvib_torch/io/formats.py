@@ -91,12 +91,12 @@ _FORMATS_OF_THE_PACKAGE = (
     ),
     packaged_format("jpeg", (".jpg", ".jpeg"), "rsvib_torch.io.images", "open_images"),
     packaged_format(
-        "png", (".png",), "rsvib_torch.io.images", "open_images", write="write_image", check="check_image",
+        "png", (".png",), "rsvib_torch.io.images", "open_images", write="write_images", check="check_images",
         dtypes=("uint8", "uint16"), keeps=_KEPT_BY_PNG,
     ),
     packaged_format(
-        "image folder", ("",), "rsvib_torch.io.images", "open_images", write="write_folder",
-        check="check_folder", kind="folder", keeps=_KEPT_BY_PNG,
+        "image folder", ("",), "rsvib_torch.io.images", "open_images", write="write_images",
+        check="check_images", kind="folder", keeps=_KEPT_BY_PNG,
     ),
     packaged_format(
         "raw", (".raw",), "rsvib_torch.io.flat_files", "open_raw", write="write_raw", companions=(".json",), keeps=_KEPT

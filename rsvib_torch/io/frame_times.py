@@ -74,15 +74,12 @@ def stated_rate(info: StackInfo) -> float | None:
     return None if spacing is None else 1.0 / spacing.interval
 
 
-def _same_rate(info: StackInfo, timing: SensorTiming) -> bool:
-    """Whether the frame rate of a file, if it states one, is that of the sensor.
+def _same_rate(spacing: _Spacing, info: StackInfo, timing: SensorTiming) -> bool:
+    """Whether the frame rate of a file is that of the sensor.
 
     If it is variable, the period of the sensor must lie between the shortest and the longest interval. Frames with
     exact times may be every n-th frame of the sensor.
     """
-    spacing = _spacing(info)
-    if spacing is None:
-        return True
     period = timing.frame_period
     if info.frame_times is not None and info.time_error == 0.0:
         period *= max(1, round(spacing.interval / period))
@@ -105,7 +102,7 @@ def exposure_times(info: StackInfo, timing: SensorTiming) -> tuple[float, ...] |
     if info.frame_times is None or info.time_error == 0.0:
         return info.frame_times
     spacing = _spacing(info)
-    if spacing is None or not _same_rate(info, timing):
+    if spacing is None or not _same_rate(spacing, info, timing):
         return None
     if spacing.numbers is not None:
         return tuple(float(number) * timing.frame_period for number in spacing.numbers)
@@ -117,7 +114,7 @@ def timing_of_stack(timing: SensorTiming, info: StackInfo) -> SensorTiming:
     if timing.frame_start_times is not None:
         return timing
     spacing, times, text = _spacing(info), exposure_times(info, timing), ""
-    if spacing is not None and not _same_rate(info, timing):
+    if spacing is not None and not _same_rate(spacing, info, timing):
         exact = info.frame_times is not None and info.time_error == 0.0
         used = "the times of the file are used" if exact else f"{timing.frame_rate:.5g} is used, with equal intervals"
         text = (

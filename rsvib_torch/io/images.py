@@ -226,33 +226,22 @@ def _write_file(file: Path, info: StackInfo, frame: Array, source: Path | None =
     write_tiff(file, one, iter([frame]), None, storage)
 
 
-def write_image(path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None) -> None:
-    """Write a PNG file of one frame; arguments as in ``StackFormat.write``."""
-    _write_file(path, info, next(frames))
-
-
-def write_folder(path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None) -> None:
-    """Write a folder with one file per frame; arguments as in ``StackFormat.write``."""
+def write_images(path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None) -> None:
+    """Write a PNG file of one frame, or a folder with one file per frame; arguments as in ``StackFormat.write``."""
+    if path.suffix:
+        _write_file(path, info, next(frames))
+        return
     path.mkdir()
     for name, source, frame in zip(_frame_names(info), info.files or [None] * info.shape[0], frames, strict=True):
         _write_file(path / name, info, frame, source)
 
 
-def _check_channels(path: Path, info: StackInfo) -> None:
+def check_images(path: Path, info: StackInfo) -> None:
+    """Refuse what PNG files cannot hold, several frames in one file, and a folder with images of other stacks."""
     if _ending(info) == ".png" and len(info.shape) == 4 and info.shape[1] not in (1, 3, 4):
         raise ValueError(f"{path}: PNG files hold 1, 3 or 4 channels, got {info.shape[1]}; write .tif")
-
-
-def check_image(path: Path, info: StackInfo) -> None:
-    """Refuse a stack that is not one frame of a PNG file."""
-    _check_channels(path, info)
-    if info.shape[0] != 1:
+    if path.suffix and info.shape[0] != 1:
         raise ValueError(f"{path}: a PNG file holds one frame, got {info.shape[0]}; write a folder")
-
-
-def check_folder(path: Path, info: StackInfo) -> None:
-    """Refuse a folder that contains images of other stacks."""
-    _check_channels(path, info)
     if path.is_dir():
         images = {f.name for f in path.iterdir() if f.suffix.lower() in _ENDINGS and not f.name.startswith(".")}
         others = images - set(_frame_names(info))

@@ -11,7 +11,7 @@ from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.arrays import Channels, FramesLike, as_tensor, channel_axis
 from rsvib_torch.checks.values import check_choice
 from rsvib_torch.execution.progress import steps
-from rsvib_torch.files.atomic import check_outputs, check_target, check_tree, check_writable, whole
+from rsvib_torch.files.atomic import check_outputs, check_target, check_writable, whole
 from rsvib_torch.io.formats import FORMATS, StackFormat, target_format
 from rsvib_torch.io.full_scale import check_dtype, frames_to_counts, known_full_scale, required_full_scale
 from rsvib_torch.io.stack_info import DIFFERENT, StackInfo, split_range
@@ -45,8 +45,8 @@ def check_info_target(
         form.check(path, info)
     if info.is_integer:
         required_full_scale(info.full_scale, np.dtype(info.dtype), path)
-    if form.kind == "tree":
-        check_tree(path, form.marker, f"{form.name} stack")
+    if form.kind == "tree" and path.exists() and not (path / form.marker).is_file():  # all its files are replaced
+        raise FileExistsError(f"cannot write {path}: it exists and is not a {form.name} stack; choose another name")
     if check_folder:
         check_writable(path, folder=form.kind != "file")
     return form
@@ -61,16 +61,9 @@ def _planned(shape: tuple[int, ...], dtype: str | None, full_scale: float | None
     info = StackInfo(tuple(shape), kind.name, full_scale)
     if like is None:
         return info
-    kept = like.with_frames(shape[0])
-    return replace(
-        kept,
-        shape=info.shape,
-        dtype=info.dtype,
-        full_scale=full_scale,
-        frame_times=None if kept.time_error else kept.frame_times,
-        time_error=0.0,
-        metadata=like.metadata_for(info.shape, info.dtype),
-    )
+    kept, metadata = like.with_frames(shape[0]), like.metadata_for(info.shape, info.dtype)
+    exact = replace(kept, frame_times=None if kept.time_error else kept.frame_times, time_error=0.0)
+    return replace(exact, shape=info.shape, dtype=info.dtype, full_scale=full_scale, metadata=metadata)
 
 
 def check_stack_target(

@@ -346,8 +346,7 @@ _SHAPES = {
         "number of frames, below 3",
     ),
     "other_axis_unknown": ReasonKind(
-        "rows move along {other} by a motion that is not known, which displaces what they show of {axis}",
-        _MORE_FRAMES,
+        "rows move along {other} by a motion that is not known, which displaces what they show of {axis}", _MORE_FRAMES
     ),
     "tone_of_chance": ReasonKind(
         "the best of so many tones explains as much of noise with a probability of {value:.2g}, {limit:g} is allowed",

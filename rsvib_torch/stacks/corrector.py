@@ -46,13 +46,7 @@ class VibrationCorrector(nn.Module):
         (True, [[True, True]])
     """
 
-    def __init__(
-        self,
-        timing: SensorTiming,
-        *,
-        detection: OptionTable = None,
-        restoration: OptionTable = None,
-    ) -> None:
+    def __init__(self, timing: SensorTiming, *, detection: OptionTable = None, restoration: OptionTable = None) -> None:
         super().__init__()
         self.detector = VibrationDetector(timing, **(detection or {}))
         self.restorer = VibrationRestorer(timing, **(restoration or {}))

@@ -294,21 +294,21 @@ def _tones_over_windows(found: Sequence[DetectedVibration | None], axis: int) ->
     return {"reliable_windows": len(reliable), "tones": sorted(described, key=lambda tone: -tone["amplitude"])}
 
 
-def fingerprint(path: Path, *, block: int = 1 << 16, most: int = 32) -> Table:
+def fingerprint(path: Path) -> Table:
     """Name, size and hash of a file, with ``NAME.json`` beside it, or of a folder.
 
-    The hash covers the names and sizes of all files, and up to ``most`` evenly spaced blocks of up to ``most`` of them,
-    the first and the last included; with the defaults, files of up to 2 MiB completely.
+    The hash covers the names and sizes of all files, and up to 32 evenly spaced blocks of 64 KiB of up to 32 of them,
+    the first and the last included: files of up to 2 MiB completely.
     """
 
     def spread(count: int) -> list[int]:
-        return sorted(set(np.linspace(0, count - 1, min(count, most)).round().astype(int).tolist()))
+        return sorted(set(np.linspace(0, count - 1, min(count, 32)).round().astype(int).tolist()))
 
     name, (path, _) = path.name, split_range(path)
     members = path.rglob("*") if path.is_dir() else (path, path.with_name(f"{path.name}.json"))
     files = sorted(file for file in members if file.is_file())
     sizes = [file.stat().st_size for file in files]
-    digest = hashlib.sha256()
+    digest, block = hashlib.sha256(), 1 << 16
     for file, size in zip(files, sizes, strict=True):
         digest.update(os.fsencode(file.relative_to(path.parent)) + f"\0{size}\0".encode())
     for number in spread(len(files)):

@@ -39,13 +39,7 @@ def memory_limit(memory: str | float | None) -> int:
 
 
 def memory_needed(
-    info: StackInfo,
-    window: int,
-    restoration: OptionTable,
-    count: int = 1,
-    *,
-    on_gpu: bool = False,
-    margin: int = 0,
+    info: StackInfo, window: int, restoration: OptionTable, count: int = 1, *, on_gpu: bool = False, margin: int = 0
 ) -> int:
     """Memory of the process in bytes while ``count`` windows are processed; arguments as in ``windows_at_once``."""
     if on_gpu:
@@ -81,7 +75,6 @@ def windows_at_once(
     """Number of windows that can be processed at once, at most ``most``, within the memory of the machine.
 
     As many frames as ``margin`` before and after each window are read as well; their motion is measured one by one.
-
     The error about too little memory states the required size and the largest window that fits.
     """
     limit = memory_limit(memory)

@@ -15,19 +15,8 @@ from pathlib import Path
 from attacks.trial import Trial
 
 _TESTS = Path(__file__).parents[2] / "tests"
-_PAGES = (
-    0,
-    2,
-    9,
-    20,
-    37,
-    52,
-    58,
-    70,
-    106,
-    114,
-    125,
-)  # of 4 KiB that are left, 0: read-only; windows and output have 55 to 60 each
+# of 4 KiB that are left, 0: read-only; windows and output have 55 to 60 each
+_PAGES = (0, 2, 9, 20, 37, 52, 58, 70, 106, 114, 125)
 
 
 def _unshare() -> list[str] | None:

@@ -90,10 +90,7 @@ def rows(options: argparse.Namespace) -> Rows:
     """Errors of the MTF and of MTF50 for all optics."""
     fewer = max(options.seeds // 5, 1)
     with one_thread():
-        return [
-            *(gaussian_row(sigma, options.seeds) for sigma in SIGMAS),
-            *(other_row(name, fewer) for name in OPTICS),
-        ]
+        return [*(gaussian_row(sigma, options.seeds) for sigma in SIGMAS), *(other_row(name, fewer) for name in OPTICS)]
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:

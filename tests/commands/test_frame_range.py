@@ -63,10 +63,7 @@ def test_restored_frames_are_those_of_the_part(place, tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "arguments"),
-    [
-        ("motion", ("--out", "{}/m.csv", "--search", "6")),
-        ("live", ("--out", "{}/live.mkv", "--window", "3")),
-    ],
+    [("motion", ("--out", "{}/m.csv", "--search", "6")), ("live", ("--out", "{}/live.mkv", "--window", "3"))],
 )
 def test_other_commands_read_the_part(place, tmp_path, capsys, name, arguments):
     assert rsvib(*command(place, name, *(part.format(tmp_path) for part in arguments), "--json")) == 0

@@ -174,7 +174,6 @@ def test_presets(place, frames, capsys):
     assert list(place.iterdir()) == []
     assert init("--preset", "in_orbit") == 0
     assert (place / "camera.toml").read_text() == presets()["in_orbit"]
-    capsys.readouterr()
     for arguments, message in (
         (("--preset", "push_scan"), "results exist already in"),
         (("--preset", "moon", "--overwrite"), "--preset must be one of in_orbit, iso12233, push_scan; got 'moon'"),

@@ -10,31 +10,11 @@ from rsvib_torch.report.results import check_same_timing
 from rsvib_torch.stacks import read_manifest
 
 TIMING = SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=104)
-WINDOW = {
-    "window": 0,
-    "first": 0,
-    "last": 3,
-    "start_time": 0.0,
-    "written": 4,
-    "frames": "as taken",
-    "detection": None,
-    "left_alone": [],
-    "outcome": None,
-    "summary": None,
-    "predicted_gain": None,
-    "error": "all pixels of frame 2 are equal",
-    "bad_frames": {"2": "all pixels are equal"},
-}
-MANIFEST = {
-    "format": "rsvib stack",
-    "version": 1,
-    "input": {},
-    "settings": {},
-    "versions": {},
-    "output": None,
-    "bad_frames": {},
-    "windows": [WINDOW, WINDOW | {"window": 1}],
-}
+WINDOW = {"window": 0, "first": 0, "last": 3, "start_time": 0.0, "written": 4, "frames": "as taken", "left_alone": []}
+WINDOW |= dict.fromkeys(("detection", "outcome", "summary", "predicted_gain"))
+WINDOW |= {"error": "all pixels of frame 2 are equal", "bad_frames": {"2": "all pixels are equal"}}
+MANIFEST = {"format": "rsvib stack", "version": 1, "output": None, "windows": [WINDOW, WINDOW | {"window": 1}]}
+MANIFEST |= {name: {} for name in ("input", "settings", "versions", "bad_frames")}
 
 
 @pytest.mark.parametrize(

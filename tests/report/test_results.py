@@ -136,12 +136,8 @@ def test_offsets_are_written_one_line_per_band(tmp_path, result):
     assert len(lines) == result.offsets.times.numel() == 58
     assert [line["offset_x_px"] for line in lines].count("") == 1
     failed = lines[29 + 3]
-    assert (failed["earlier_frame"], failed["later_frame"], failed["row"], failed["offset_y_px"]) == (
-        "1",
-        "2",
-        "64.0",
-        "",
-    )
+    names = ("earlier_frame", "later_frame", "row", "offset_y_px")
+    assert [failed[name] for name in names] == ["1", "2", "64.0", ""]
     for name, values in (("time_s", result.offsets.times), ("fitted_y_px", result.fitted[..., 1])):
         np.testing.assert_array_equal([float(line[name]) for line in lines], values.flatten())
     names = ("offset_x_px", "residual_x_px", "fitted_x_px")
@@ -166,9 +162,8 @@ def test_offset_figure_draws_the_measurements(tmp_path, result):
             np.testing.assert_allclose(line.get_ydata(), result.fitted[pair, :, axis])
         assert "(px)" in upper.get_ylabel()
     below = panels[f"mean |residual| {result.residual[1]:.4f} px"]
-    np.testing.assert_allclose(
-        below.collections[0].get_offsets()[:, 1], (result.offsets.offsets - result.fitted)[..., 1][good]
-    )
+    residual = (result.offsets.offsets - result.fitted)[..., 1][good]
+    np.testing.assert_allclose(below.collections[0].get_offsets()[:, 1], residual)
     assert "(ms)" in below.get_xlabel()
     texts = " ".join(text.get_text() for axes in figure.axes for text in axes.texts)
     assert "2.000 ± 0.010 px at 60.000 ± 0.010 Hz" in texts

@@ -198,10 +198,7 @@ def test_results_are_drawn(results, tmp_path):
     for number, (name, result) in enumerate(results):
         path = tmp_path / f"{number}.png"
         if name not in DRAWN:
-            with pytest.raises(
-                TypeError,
-                match=r"has no figure; these have one: ClockAlignment, DetectionResult, D",
-            ):
+            with pytest.raises(TypeError, match=r"has no figure; these have one: ClockAlignment, DetectionResult, D"):
                 result.plot(path)
         elif name in ("OffsetCurve", "Vibration") and result.batch_shape:
             with pytest.raises(ValueError, match=r"a batch of shape \(3,\) has no figure: select one, result\[0\]"):

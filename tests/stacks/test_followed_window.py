@@ -23,9 +23,12 @@ SCENE = draw_scene(208, 208, seed=2)
 STILL = crop(SCENE)
 
 
+def steady(times):
+    return AMPLITUDE * np.sin(2 * np.pi * FREQUENCY * times[..., None] + PHASE)
+
+
 def decaying(times):
-    turned = 2 * np.pi * FREQUENCY * times[..., None] + PHASE
-    return AMPLITUDE * np.exp(-times / DECAY)[..., None] * np.sin(turned)
+    return np.exp(-times / DECAY)[..., None] * steady(times)
 
 
 @pytest.fixture(scope="module", name="place")
@@ -117,23 +120,16 @@ def test_the_frames_before_and_behind_a_change_of_frequency_are_followed():
 def test_a_frame_at_rest_contradicts_the_tones_of_the_others():
     """The rows of seven frames outweigh those of the last one, which restoration would make worse by 20 dB."""
     stop = 7 * TIMING.frame_period - 1e-3
-
-    def moved(times):
-        return AMPLITUDE * np.sin(2 * np.pi * FREQUENCY * times[..., None] + PHASE) * (times < stop)[..., None]
-
-    found = rsv.detect_vibration(take_frames(SCENE, TIMING, Curve(moved), 8, noise=0.003), TIMING)
+    moved = Curve(lambda t: steady(t) * (t < stop)[..., None])
+    found = rsv.detect_vibration(take_frames(SCENE, TIMING, moved, 8, noise=0.003), TIMING)
     assert not found.reliable.any()
     assert all("rows_unexplained" in [one.code for one in of_axis] for of_axis in found.findings)
 
 
 def test_a_large_vibration_that_decays_fast_is_followed():
     """The first frame is known to one tracker, half a frame period from the pair that it is measured in."""
-
-    def moved(times):
-        turned = 2 * np.pi * FREQUENCY * times[..., None] + PHASE
-        return 2.5 * AMPLITUDE * np.exp(-2.5 * times[..., None]) * np.sin(turned)
-
-    found = rsv.follow_vibration(take_frames(SCENE, TIMING, Curve(moved), 12, noise=0.003), TIMING)
+    moved = Curve(lambda t: 2.5 * np.exp(-2.5 * t[..., None]) * steady(t))
+    found = rsv.follow_vibration(take_frames(SCENE, TIMING, moved, 12, noise=0.003), TIMING)
     reliable = found.reliable.numpy()
     assert reliable.sum() > 20
     assert reliable[0].all()

@@ -191,14 +191,11 @@ def test_memory_sizes_are_parsed():
 
 
 @pytest.mark.parametrize(
-    ("options", "error", "message"),
-    [
-        ({"window": 1}, ValueError, "window must be at least 2, got 1"),
-        ({"memory": "1KB"}, ValueError, "is too little"),
-    ],
+    ("options", "message"),
+    [({"window": 1}, "window must be at least 2, got 1"), ({"memory": "1KB"}, "is too little")],
 )
-def test_invalid_options_are_errors_without_files(whole, tmp_path, options, error, message):
-    with pytest.raises(error, match=message):
+def test_invalid_options_are_errors_without_files(whole, tmp_path, options, message):
+    with pytest.raises(ValueError, match=message):
         process_small(whole / "frames.tif", tmp_path / "out.tif", **options)
     assert list(tmp_path.iterdir()) == []
 

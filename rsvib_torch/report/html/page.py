@@ -56,7 +56,7 @@ class Report:
     left_alone: tuple[Reason, ...] = ()  # a reason for each axis that was not restored
     options: Table = field(default_factory=dict)  # options of ``restore``
     first: int = 0  # number of the first of the frames
-    next_steps: tuple[tuple[str, str], ...] = ()  # what to do next, and the command that does it, or an empty text
+    next_steps: tuple[str, ...] = ()  # what to do next: sentences, with the command that does it on a line of its own
     command: str | None = None  # the command line that wrote the page; None for a page written from Python
     windows: StackManifest | None = None  # windows of the stack that were processed separately; None if there are none
     created: datetime = field(default_factory=lambda: datetime.now().astimezone())  # time at which the page was made

@@ -111,10 +111,8 @@ def before_after(
 ) -> BeforeAfter:
     """Encode two images (H, W) or (C, H, W) of one shape, or one, with the same grey scale.
 
-    The grey scale covers all but the darkest and the brightest 0.2 % of the values of both images. Images with a side
-    above ``longest`` px are reduced by averaging; around the row and column ``full_at`` they are kept at full
-    resolution beside the reduced ones, and not reduced at all up to 2048² px. ``exact`` encodes as PNG instead of as
-    JPEG.
+    Images with a side above ``longest`` px are reduced by averaging; around the row and column ``full_at`` they are
+    kept at full resolution beside the reduced ones, and not reduced at all up to 2048² px. ``exact``: PNG, not JPEG.
     """
     height, width = images[0].shape[-2:]
     if full_at is not None and height * width <= _FULL_PIXELS:
