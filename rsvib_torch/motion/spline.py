@@ -78,7 +78,7 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         if largest > MAX_DISPLACEMENT:
             raise ValueError(f"coefficients must be at most {MAX_DISPLACEMENT:g} px, got {largest:g}")
         axes = values.shape[-2]
-        tones = Vibration.still(values.shape[:-2], axes=axes) if tones is None else tones
+        tones = Vibration.still(values.shape[:-2], values.device, axes=axes) if tones is None else tones
         tones = tones.to(values.device)
         if tones.batch_shape != values.shape[:-2] or tones.num_axes != axes:
             raise ValueError(
