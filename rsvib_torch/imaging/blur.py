@@ -52,8 +52,9 @@ class RowPSF:
 
     def centroid(self) -> Tensor:
         """Mean displacement of each row in px, (..., R, 2), axes (x, y): the first moment of its kernel."""
-        rows, columns = (torch.arange(count).to(self.weights) for count in self.weights.shape[-2:])
-        x, y = (self.weights.sum(-2) * columns).sum(-1), (self.weights.sum(-1) * rows).sum(-1)
+        weights = self.weights
+        rows, columns = (weights.new_ones(count).cumsum(0) - 1 for count in weights.shape[-2:])
+        x, y = (weights.sum(-2) * columns).sum(-1), (weights.sum(-1) * rows).sum(-1)
         return torch.stack([x, y], dim=-1) + self.first_tap
 
     def dense(self) -> tuple[Tensor, tuple[int, int]]:

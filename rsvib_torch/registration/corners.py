@@ -23,6 +23,10 @@ _NOISE, _FAINT = 12.5, 0.02
 PATCH = 11  # px, side of the patch that is compared; 21 px blur the motion of the rows, with 1.7 times the residuals
 _COARSE = 21  # px, side of the patch in the pyramid, where the motion is found
 _LARGEST_MOTION = 0.25  # of the longer side, which the coarsest level of the pyramid reaches
+# px, side of the square whose mean is subtracted from every pixel: light that flickers by 35 % moved the corners of its
+# rows, with residuals of 0.18 instead of 0.09 px and tones of 0.13 px; other clips are the same within 0.002 px.
+# Division by the mean enlarges the noise of dark parts: residuals of 0.11 px
+_AROUND = 31
 _MAX_RETURN = 0.3  # px, between a corner and the point where the way back from the other frame ends
 _MOST_PIXELS = 700_000  # of a frame in which corners are followed; the sides of larger ones are halved
 _MIN_CORNERS = 8  # of a pair of frames; four components are determined, and wrong matches are rejected
@@ -97,6 +101,9 @@ class CornerFollower:
         scale = reduction(*grey.shape) if self._consistent else 1
         before, known, voted = self._before, self._known, self._votes
         second = np.asarray(cv2.resize(grey, (width // scale, height // scale), interpolation=cv2.INTER_AREA), np.uint8)
+        if self._consistent:
+            around = cv2.blur(second, (_AROUND, _AROUND))
+            second = np.asarray(cv2.addWeighted(second, 1.0, around, -1.0, 128.0), np.uint8)
         starts = np.array([self._start, start])
         self._before, self._start = (second, mask), start
         self._known, self._votes = _NO_CORNERS

@@ -116,6 +116,19 @@ def test_a_subject_on_two_fifths_of_the_frame_is_not_followed():
     assert np.abs(np.diff(true, axis=0)[:, :2]).max() > 2.0
 
 
+def test_a_lamp_that_flickers_is_no_vibration():
+    """Rows have up to twice the light of the same rows before: the frames were refused as different scenes."""
+    frames = recorded({}, subject=False)
+    rows = np.arange(HEIGHT)[:, None] * TIMING.row_time
+    for number, frame in enumerate(frames):
+        light = 1 + 0.35 * np.sin(2 * np.pi * 100.0 * (number / RATE + rows))
+        frame[:] = np.clip(np.round(0.74 * light * frame), 0, 255)
+    path, times = fitted(frames)[1], np.arange(2, COUNT - 2) / RATE + 0.01
+    assert all(abs(tone.coefficient) < 0.07 for tone in path.tones(0.8))  # px; the contrast still flickers
+    errors = np.diff(path.places(times) - hand(times).T, axis=0)[:, :2]
+    assert np.sqrt(np.square(errors).mean()) < 0.1  # parallax
+
+
 def test_a_vibration_faster_than_the_exposure_is_found():
     """Its mean over 1/60 s is a fifth of the amplitude, with the opposite sign."""
     timing = SensorTiming(row_time=90e-6, exposure_rows=1 / 60 / 90e-6, frame_rows=1 / RATE / 90e-6)
