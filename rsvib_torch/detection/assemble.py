@@ -48,8 +48,8 @@ def assembled(
     reasons against each axis in row order; the timing is in image order, and ``interval`` in s is that between two
     frames, for the gain. ``blur`` (B, 3) as in ``OtherMotion`` is None if it was not measured.
     """
-    row_timing, curve = timing.in_row_order(), offsets[0]
-    predicted = torch.from_numpy(offsets[1]).to(curve.offsets.device)
+    row_timing, (curve, fitted) = timing.in_row_order(), offsets
+    predicted = torch.from_numpy(fitted).to(curve.offsets.device)
     units = scale.units(predicted)
     vibration = scale.motion(motion_of_fit(fit)).from_row_order(timing)
     sensitivity = timing_sensitivity(fit, row_timing, num_frames, scale.height)

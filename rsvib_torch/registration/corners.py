@@ -41,10 +41,6 @@ _WOBBLE, _AGREE, _PARTS = 12.0, 3.0, 12
 # px, from one similarity, of half of the corners that decide; corners are of the layer up to twice as far from it. With
 # 1 px as the least, a subject on 40 % of the frame moves the path by 0.2 px rms, with 0.7 px by 0.05 px
 _LAYER_LIMITS = np.array([0.7, 1.4, 2.8, 5.6])
-# From the motion of the layer, in units of its limit, beyond which a corner moves apart from it; and the part of the
-# corners that must: where a subject moves like the scene for a moment, nothing is learned about it
-_APART, _LEAST_APART = 2.0, 0.1
-_DECIDING = 0.1  # of the corners; with 0.25, the path changed between a scene that vibrates and a subject
 _NO_CORNERS = np.zeros((0, 2)), np.zeros(0, np.int64)
 
 
@@ -88,7 +84,7 @@ class CornerFollower:
         self._timing, self._most, self._consistent = timing, most, consistent
         self._start = 0.0  # s, of the frame before
         self._before: tuple[Grey, Grey | None] | None = None  # the frame before, of reduced size, and its mask
-        self._known, self._votes = _NO_CORNERS  # corners in it, and the votes of each of them, see ``_from_layer``
+        self._known, self._votes = _NO_CORNERS  # corners in it, and the votes of each of them, see ``_in_layer``
 
     def next(self, grey: Grey, start: float, mask: Grey | None = None) -> Corners | None:
         """Corners between the frame before and this one (H, W), whose exposure starts at ``start`` in s.
@@ -110,12 +106,13 @@ class CornerFollower:
         if before is None:
             return None
         found = find_corners(before[0], known, before[1], self._most)
-        votes, layer = np.pad(voted, (0, len(found) - len(voted))), np.ones(len(found), bool)
+        votes = np.pad(voted, (0, len(found) - len(voted)))
         ends, good = follow_corners(before[0], second, found)
         if mask is not None:
             x, y = ends[good].round().astype(np.int64).T
             good[good] = mask[y, x] > 0
-        found, ends, votes, layer = found[good], ends[good], votes[good], layer[good]
+        found, ends, votes = found[good], ends[good], votes[good]
+        layer = np.ones(len(found), bool)
         # 2. Keep those that follow one affine motion and the vibration of their rows.
         axis, count = (1, height) if timing.scan_axis == -2 else (0, width)
         if self._consistent:
@@ -124,11 +121,8 @@ class CornerFollower:
             if agree.sum() < max(_MIN_CORNERS, least):
                 return None
             found, ends, votes = found[agree], ends[agree], votes[agree]
-            distance = _from_layer(found, ends, votes, scale)
-            layer, apart = distance < 1, distance > _APART
-            if apart.mean() > _LEAST_APART:
-                votes = np.where(layer, votes + 1, np.where(apart, np.minimum(votes, 0) - 1, votes))
-            self._known, self._votes = ends, votes
+            layer = _in_layer(found, ends, votes, scale)
+            self._known, self._votes = ends, np.where(layer, votes + 1, np.minimum(votes, 0) - 1)
         found, ends = ((points + 0.5) * scale - 0.5 for points in (found, ends))
         # 3. The times of their rows.
         rows = np.stack([found[:, axis], ends[:, axis]], -1)
@@ -156,24 +150,24 @@ def _agreeing(found: Points, ends: Points, axis: int, length: int, scale: int) -
     return agree
 
 
-def _from_layer(found: Points, ends: Points, votes: NDArray[np.int64], scale: int) -> Array:
-    """(N,) distance of corners from the motion of the layer that is followed, 1 at its limit; 0 if there is no layer.
+def _in_layer(found: Points, ends: Points, votes: NDArray[np.int64], scale: int) -> NDArray[np.bool_]:
+    """(N,) bool, whether corners move with the layer that is followed; all of them if there is no layer.
 
     A layer is a part of the scene that moves as one similarity. A vibration moves its rows apart: of several limits,
     the smallest counts within which half of the corners that decide are. Frames are reduced by ``scale``; the ``votes``
-    of corners are the pairs in which they moved with the layer or, negative, apart from it.
+    of corners are the pairs in which they moved with the layer or, negative, apart from it since then.
     """
     # 1. The corners that decide: those that moved with the layer last, else those that did not move apart from it. A
     # subject moves with the layer for a moment, and apart from it later.
-    least = max(_MIN_CORNERS, _DECIDING * len(votes))
+    least = max(_MIN_CORNERS, _MIN_SHARE * len(votes))
     decide = next((of for of in (votes > 0, votes >= 0) if of.sum() >= least), np.ones(len(found), bool))
     # 2. The motion of the layer, and what moves like it.
     for limit in _LAYER_LIMITS / scale:
         similarity, inside = cv2.estimateAffinePartial2D(found[decide], ends[decide], ransacReprojThreshold=limit)
         if similarity is not None and inside.mean() > 0.5:
             rest = ends - found @ similarity[:, :2].T - similarity[:, 2]
-            return np.asarray(np.hypot(*rest.T) / (2 * limit))
-    return np.zeros(len(found))
+            return np.asarray(np.hypot(*rest.T) < 2 * limit)
+    return np.ones(len(found), bool)
 
 
 def reduction(height: int, width: int) -> int:

@@ -325,7 +325,8 @@ _SHAPES = {
         compares="largest part of a tone of a video that is left in a third of the rows, above 25 %",
     ),
     "corners_unexplained": _px(
-        "corners move by {value:.3g} px that no path of the camera and no tones explain, {limit:.2g} px are allowed",
+        "corners move by {value:.3g} px that no path of the camera and no tones explain, {limit:.2g} px are allowed; "
+        "parts of the scene may move by themselves",
         compares="standard deviation of the offsets of corners in a window of a video",
     ),
     "motion_unexplained": _px(

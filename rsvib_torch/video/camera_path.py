@@ -12,7 +12,7 @@ is not of the layer of the corners, which a subject on 40 % of the frame would m
 import math
 from collections.abc import Callable, Iterable, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 
@@ -58,6 +58,7 @@ _ALIASES = 2  # frequencies on each side of a tone that are compared with it
 # 0.003 to 0.005 Hz, 2 to 4 standard deviations of noise
 _DRIFT = 0.012
 _ROUNDS = 4  # of a robust fit
+_HALF, _FOUR_FIFTHS = 1.177, 1.794  # standard deviations, below which that part of lengths of two normal components is
 # Residual of the path of a layer over that of all corners, before tones are found: 0.07 to 0.63 beside a subject on 20
 # to 40 % of the frame, 0.98 to 2.3 in clips with tones of 1.5 to 5 px
 _EXPLAINS_MORE = 0.8
@@ -156,8 +157,7 @@ class WindowPath:
     knots: Array  # (N, 4) coefficients of the spline
     tones: tuple[WindowTone, ...]
     residual: float  # px, robust standard deviation of the offsets of corners along one axis
-    # px, likewise; where the path is that of a layer, a part of the corners beside it belongs to it
-    unexplained: float
+    residual_of_most: float  # px, likewise; where the path is that of a layer, from four fifths of all corners
 
     def path(self, times: Array, derivative: int = 0) -> Array:
         """(N, 4) components of the path, or their derivatives, at times (N,) in s."""
@@ -270,10 +270,9 @@ class _WindowFit:
                 (knots_of_tone, _basis(taps[0][part] - knots_of_tone[0], taps[1][part], len(knots_of_tone)))
             )
         self.tones: list[WindowTone] = []
-        self.weights = corners.layer.astype(np.float64)
-        self.sigma = math.inf  # px, standard deviation of a corner along one axis
-        self.residual = math.inf  # px, likewise of all corners, also of those that are not of the layer
-        self.of_most = math.inf  # px, likewise, from four fifths of the corners instead of half of them
+        self.layer, self.weights = np.ones(len(factors), bool), np.ones(len(factors))
+        self.sigma = math.inf  # px, standard deviation of a corner of the layer along one axis
+        self.distance = np.zeros(len(factors))  # px, of all corners from what is explained
         self.unexplained = math.inf  # px^2, mean over the pairs of the square of the median residual
         self.knots = np.zeros((4, self.count))
 
@@ -329,13 +328,10 @@ class _WindowFit:
             residual = self.corners.offsets.copy()
             for (part, *_), index, of_pair in zip(self.pairs, blocks, columns, strict=True):
                 residual[part] -= (of_pair @ solution[index]).reshape(2, -1).T
-            length = np.hypot(*residual.T)
-            of_layer = length[self.corners.layer]
-            self.sigma = max(float(np.median(of_layer)) / 1.177, 1e-3)  # of two normal components: 1.177 std
+            self.distance = length = np.hypot(*residual.T)
+            self.sigma = max(float(np.median(length[self.layer])) / _HALF, 1e-3)
             medians = self._medians(length)
-            self.weights = self._weights(length, self.sigma, medians / 1.177)
-            self.residual = float(np.median(length)) / 1.177
-            self.of_most = float(np.quantile(length, 0.8)) / 1.794
+            self.weights = self._weights(length, self.sigma, medians / _HALF)
             self.unexplained = float(np.square(medians).mean())
             for tone, (real, imaginary) in zip(self.tones, solution[of_tones], strict=True):
                 tone.knots = real + 1j * imaginary
@@ -345,7 +341,7 @@ class _WindowFit:
 
     def _medians(self, distance: Array) -> Array:
         """Median of the layer of every pair of frames."""
-        return np.array([np.median(distance[part][self.corners.layer[part]]) for part, *_ in self.pairs])
+        return np.array([np.median(distance[part][self.layer[part]]) for part, *_ in self.pairs])
 
     def _weights(self, distance: Array, std: float, of_pairs: Array) -> Array:
         """Weights of residuals with a standard deviation, or that of their pair if it is larger.
@@ -360,9 +356,21 @@ class _WindowFit:
         knots = np.zeros(self.envelope_knots, complex)
         tone = WindowTone(axis, frequency, knots, self.start - self.origin, self.envelope_step, slope)
         other = copy(self)
-        other.tones, other.weights = [*map(copy, self.tones), tone], self.corners.layer.astype(np.float64)
+        other.tones, other.weights = [*map(copy, self.tones), tone], self.layer.astype(np.float64)
         other.solve()
         return other
+
+    def of_layer(self) -> "_WindowFit":
+        """The path of the layer of the corners; this one, if it explains about as much of all corners.
+
+        A vibration of several px makes layers of the rows that move alike.
+        """
+        if self.corners.layer.all():
+            return self
+        other = copy(self)
+        other.layer, other.weights = self.corners.layer, self.corners.layer.astype(np.float64)
+        other.solve(_ROUNDS)
+        return other if np.median(other.distance) < _EXPLAINS_MORE * np.median(self.distance) else self
 
     def has_blind_tone(self, interval: float) -> bool:
         """Whether the frequency of a tone has been corrected to one that frames do not show."""
@@ -479,16 +487,9 @@ def fit_window(
     A corner is displaced by the mean of the displacement over the times ``averaged``; the ``readout`` takes from the
     first to the last row (s). Without ``has_tones``, no tones are looked for; ``slopes`` in Hz/s are those of tones.
     """
-    # The path of all corners, or that of a layer of them if it explains more: a vibration of several px makes layers of
-    # the rows that move alike.
-    fit, layer = (
-        _WindowFit(replace(corners, layer=chosen), interval, averaged)
-        for chosen in (np.ones_like(corners.layer), corners.layer)
-    )
+    fit = _WindowFit(corners, interval, averaged)
     fit.solve(_ROUNDS)
-    layer.solve(_ROUNDS)
-    has_layer = layer.residual < _EXPLAINS_MORE * fit.residual
-    fit = layer if has_layer else fit
+    fit = fit.of_layer()
     # Frequencies above those that the path follows, up to those that rows resolve, without blind ones.
     step = 0.3 / (fit.times.max() - fit.times.min())
     frequencies = np.arange(_LOWEST / interval, 0.5 * _CELLS / readout, step)
@@ -530,9 +531,10 @@ def fit_window(
         fit.solve()
         fit.keep_tones(interval)
     knots = fit.knots.T / np.array([1.0, 1.0, fit.reach, fit.reach])
-    # With a subject on 40 % of the frame, tones of 0.1 px were found that are none.
-    unexplained = fit.of_most if has_layer else fit.residual
-    return WindowPath(fit.origin, fit.start, fit.step, knots, tuple(fit.tones), fit.residual, unexplained)
+    residual = residual_of_most = float(np.median(fit.distance)) / _HALF
+    if not fit.layer.all():  # with a subject on 40 % of the frame, tones of 0.1 px were found that are none
+        residual_of_most = float(np.quantile(fit.distance, 0.8)) / _FOUR_FIFTHS
+    return WindowPath(fit.origin, fit.start, fit.step, knots, tuple(fit.tones), residual, residual_of_most)
 
 
 @dataclass(frozen=True, eq=False)

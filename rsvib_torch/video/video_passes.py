@@ -331,7 +331,7 @@ class VideoPasses:
         findings = self._findings(tones, window)
         copies = sum(fault.endswith(_IS_COPY) for fault in motion.faults.values()) / len(times)
         for code, value, allowed in (
-            ("corners_unexplained", window.unexplained, path.allowed),
+            ("corners_unexplained", window.residual_of_most, path.allowed),
             ("frames_repeated", copies, _MAX_COPIES),
         ):
             if value > allowed:

@@ -99,7 +99,7 @@ def test_a_part_of_the_rows_that_moves_by_itself_is_no_vibration():
         frame[top:] = dashboard
     (window,) = fitted(frames)[1].windows
     # what moves apart from the scene refuses the window; without a limit, there were six tones, of up to 10 px
-    assert window.unexplained > 0.3
+    assert window.residual_of_most > 0.3
     assert all(abs(tone.at(0.0, 0.0).coefficient) < 0.5 for tone in window.tones)
 
 
