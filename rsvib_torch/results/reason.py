@@ -314,10 +314,10 @@ _FOLLOWED = {
 }
 _SHAPES = {
     "frames_repeated": ReasonKind(
-        "{value:.0%} of the frames are constant or copies, {limit:.0%} are allowed: the video does not have the times "
-        "of the camera",
+        "{value:.0%} of the frames are copies of the frame before, {limit:.0%} are allowed: the video does not have "
+        "the times of the camera",
         "use the video as the camera recorded it",
-        "part of the frames of a video that are constant or copies of the frame before, above 5 %",
+        "part of the frames of a video that are copies of the frame before, above 5 %",
     ),
     "rows_differ": ReasonKind(
         "{value:.0%} of a tone is left in a third of the rows, {limit:.0%} is allowed: a part of the picture moves by "

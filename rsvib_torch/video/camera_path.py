@@ -646,6 +646,6 @@ def shake(corners: Corners) -> tuple[Array, float]:
         rest = corners.offsets - columns @ motion
         length = np.hypot(*rest.T)
         weight = _robust_weights(length, float(np.median(length)))
-    part = (corners.rows * 12).astype(np.int64)
+    part = np.where(corners.layer, (corners.rows * 12).astype(np.int64), -1)
     bands = [np.median(rest[part == number], 0) for number in range(12) if (part == number).sum() > 4]
     return motion[:2], float(np.sqrt(np.mean(np.square(bands)))) if bands else 0.0

@@ -38,11 +38,10 @@ from rsvib_torch.stacks.run_folder import (
 )
 from rsvib_torch.video import Margins
 from rsvib_torch.video.video_frames import Frame, FrameTrack, RestoredFrame, VideoFrames
-from rsvib_torch.video.video_passes import CHECKED_FRAMES, PART_FRAMES, VideoMotion, VideoPasses
+from rsvib_torch.video.video_passes import PART_FRAMES, VideoMotion, VideoPasses
 
-# A video that shakes more is refused: wrong settings make it 1.5 to 5 times as shaky. 0.1 px is not visible. Rows are
-# measured less well, because objects at other distances move beside them.
-_MORE_SHAKING, _VISIBLE_SHAKING = {"frame_to_frame": 1.1, "rows": 1.5}, 0.1  # -, px
+# A video that shakes more is refused: wrong settings make it 1.5 to 5 times as shaky. 0.1 px is not visible.
+_MORE_SHAKING, _VISIBLE_SHAKING = 1.1, 0.1  # -, px
 
 _JUDGED_FRAMES = 4  # of each part, two neighbouring ones of which are judged
 
@@ -73,10 +72,10 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
 
     Two frames of each part of 32 are judged. Of a part that is worse, or that path and tones do not explain, and that
     shakes more than as taken, rows are not moved apart: no vibration, and with ``steady`` no wobble, is undone; if it
-    shakes less, it has no verdict. Frames that cannot be decoded, constant frames and copies are replaced by the frame
-    before. The video is encoded in parts in the folder ``.NAME.rsvib`` beside it, from which an interrupted run is
-    resumed. The shaking of the first frames of each part is compared with that of the input: a video that shakes more
-    is not written.
+    shakes less, it has no verdict. Frames that cannot be decoded and constant frames are replaced by the frame before;
+    copies of the frame before are moved along the smooth path. The video is encoded in parts in the folder
+    ``.NAME.rsvib`` beside it, from which an interrupted run is resumed. A video whose corners shake more in the
+    restored frames than in those of the input is not written.
 
     Args:
         source: A video, or another stack as in ``read_stack``.
@@ -184,7 +183,7 @@ def _check_shaking(folder: RunFolder, *, is_explained: bool) -> None:
             "shaking of the restored video cannot be measured"
         )
     for key, (before, after) in shaking.items():
-        if after > _MORE_SHAKING[key] * before + _VISIBLE_SHAKING:
+        if after > _MORE_SHAKING * before + _VISIBLE_SHAKING:
             folder.remove()
             raise ValueError(
                 f"the restored video would shake more than the input: {after:.2g} px {names[key]}, {before:.2g} px "
@@ -246,7 +245,7 @@ def _restored_parts(
                 verdicts[part] = verdict = video.verdict(motion, first)
                 # Parallax and overlays make two frames worse that shake less: corners decide.
                 is_doubted = not video.is_explained(motion, part) or (verdict and verdict.overall == "worse")
-                is_worse = bool(is_doubted) and video.shakes_more(motion, first)
+                is_worse = bool(is_doubted) and video.shakes_more(motion, [track for track, _ in first])
                 if is_doubted and not is_worse:
                     verdicts[part] = None
                 for track, frame in chain(first, tracked):
@@ -279,7 +278,6 @@ def _encode_part(
     """
     layout, name = video.frames, f"{part:06d}{folder.sink.suffix.lower()}"
     tracks: list[FrameTrack] = []
-    written: list[Frame] = []  # the first frames
     before: Planes | None = None  # the frame before, without margins cut off
     if part > 0:
         with folder.open(f"{part - 1:06d}.npy") as file:
@@ -292,16 +290,13 @@ def _encode_part(
             if tracks:
                 progress()  # the frame before is complete
             before = _without_gaps(restored, before, layout)
-            final = layout.frame(_cut(before, margins))
             with disk_errors_named(folder):
-                write(final)
-            if len(tracks) < CHECKED_FRAMES:
-                written.append(final)
+                write(layout.frame(_cut(before, margins)))
             tracks.append(track)
         with disk_errors_named(folder):
             opened.close()  # the file is complete
     assert before is not None
-    record = video.record(part, tracks, motion, verdicts[part], written)
+    record = video.record(part, tracks, motion, verdicts[part])
     folder.add(record, [name], np.ascontiguousarray(layout.frame(before)))
     progress()
 

@@ -22,10 +22,11 @@ from rsvib_torch.io.full_scale import counts_to_frames
 from rsvib_torch.io.video import VideoReader
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.detected_vibration import DetectedVibration
+from rsvib_torch.motion.field import displacement_at
 from rsvib_torch.motion.sampling import recorded_offsets
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
-from rsvib_torch.numerics.tables import Array, tensor
+from rsvib_torch.numerics.tables import Array, table, tensor
 from rsvib_torch.registration.corners import CornerFollower, Corners, reduction
 from rsvib_torch.restoration import RestorationVerdict
 from rsvib_torch.results.presentation import AXIS_NAMES
@@ -41,7 +42,8 @@ from rsvib_torch.video.steadying import steady_shifts
 from rsvib_torch.video.video_frames import Frame, FrameTrack, VideoFrames
 
 PART_FRAMES = 32  # of a part of the video, which is encoded by itself; an interrupted run repeats at most one part
-CHECKED_FRAMES = 8  # of each part, in which the shaking of the output is measured
+_CHECKED_FRAMES = 8  # of each part, in which the shaking is measured
+_ROUNDS = 3  # in which the place of a corner is found where roll and zoom are undone
 _AHEAD = 4  # frames decoded before they are used
 _GAIN_ERROR = 0.02  # of an amplitude: the mean over the patch of a corner is known so well (52 to 205 Hz: 0.4 to 1.6 %)
 # px^-2, of the third cumulant of the path within an exposure, by which a blurred corner is found beside the mean of the
@@ -52,7 +54,6 @@ _MAX_APART = 0.25  # of a tone, left in a third of the rows: tones of cameras ha
 # Of the usual change from frame to frame: at least 0.18 in 36 clips that a hand holds, and at most 0.12 of copies in a
 # video of 24 frames per second that is stored as 30
 _COPY, _MEMORY = 0.15, 8
-_IS_COPY = ", or a copy of the frame before"
 _MAX_COPIES = 0.05  # of the frames; with more, frames were taken at other times than stored: 143 Hz became 149 Hz
 _SMALLEST = 0.02  # px at the corners; roll and zoom below are left out, because restoration is faster without
 
@@ -62,10 +63,14 @@ class VideoMotion:
     """The motion of all frames of a video."""
 
     path: CameraPath | RotationAlignment  # of the camera, from corners or by a gyroscope
-    times: Array  # (N,) s, middle of every frame
+    times: Array  # (N,) s, middle of every frame, and of copies that of the frame before
     removed: Callable[[int], Vibration | FreeMotion]  # from a frame, the middle of which is the time origin
     faults: dict[int, str]  # number of each frame that could not be used, with the reason
-    shakes: dict[int, tuple[Array, float]]  # ``shake`` between the frame of this number and the next one
+    corners: dict[int, Corners]  # between the frame of this number and the next one, of the first ones of each part
+
+    def is_usable(self, index: int) -> bool:
+        """Whether a frame could be used, and is no copy."""
+        return index not in self.faults and (index == 0 or self.times[index] > self.times[index - 1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,13 +108,14 @@ class VideoPasses:
         timing = self.frames.job.timing
         half = timing.time_to_middle(self.frames.size[int(timing.scan_axis)])
         times = np.array(self.starts) + half
+        taken = times.copy()  # of copies, when the frame before was taken
         faults: dict[int, str] = {}
-        shakes: dict[int, tuple[Array, float]] = {}
+        checked: dict[int, Corners] = {}  # between the first frames of each part
         compared: dict[int, Corners] = {}  # with a gyroscope, corners between some frames and the next ones
 
         def pairs() -> Iterator[Corners | None]:
             with closing(
-                prefetched(self._followed(times, faults, shakes, compared), WINDOW_FRAMES)
+                prefetched(self._followed(taken, faults, checked, compared), WINDOW_FRAMES)
             ) as frames:  # a window is fitted in this thread meanwhile
                 for corners in frames:
                     progress()
@@ -118,16 +124,16 @@ class VideoPasses:
         if self.rates is None:
             with ONE_BLAS_THREAD:
                 path = camera_path(pairs(), timing, self.frames.size, has_tones=not self.stabilised)
-            places = path.places(times)
+            places = path.places(taken)
             shift = self._to_steady(times, lambda number, others: places[others] - places[number])
-            polynomials = np.stack([path.derivatives(times, 1), path.derivatives(times, 2), shift], 1)
+            polynomials = np.stack([path.derivatives(taken, 1), path.derivatives(taken, 2), shift], 1)
             polynomials[:, :2] *= not self.stabilised
 
             def by_corners(index: int) -> Vibration:
-                return self._removed(path.tones(float(times[index])), polynomials[index])
+                return self._removed(path.tones(float(taken[index])), polynomials[index])
 
-            return VideoMotion(path, times, by_corners, faults, shakes)
-        for _ in pairs():  # for ``compared``, and for the shaking
+            return VideoMotion(path, taken, by_corners, faults, checked)
+        for _ in pairs():  # for ``compared``, and for ``checked``
             pass
         tracks = tracks_of_pairs(compared, self.starts, timing, self.frames.size)
         starts = tensor(np.array([self.starts[index : index + 2] for index in compared]))
@@ -135,18 +141,21 @@ class VideoPasses:
         found = align_rates(tracks, starts, size, timing, self.rates, self.camera, fit_focal_length=fitted)
         if not found.reliable:
             raise ValueError(f"the gyroscope ({self.rates.source}) does not fit the video: {'; '.join(found.reasons)}")
-        rotation = RecordedRotation.aligned(self.rates, found, times)
+        rotation = RecordedRotation.aligned(self.rates, found, taken)
         turned = self._to_steady(times, rotation.apart)
-        return VideoMotion(found, times, lambda index: rotation.motion(index, turned[index], half), faults, shakes)
+        return VideoMotion(found, taken, lambda index: rotation.motion(index, turned[index], half), faults, checked)
 
     def _followed(
         self,
-        times: Array,
+        taken: Array,
         faults: dict[int, str],
-        shakes: dict[int, tuple[Array, float]],
+        checked: dict[int, Corners],
         compared: dict[int, Corners],
     ) -> Generator[tuple[Corners | None, ...], None, None]:
-        """Of every frame, the corners between it and the usable frame before, if there is one; fills the tables."""
+        """Of every frame, the corners between it and the usable frame before, if there is one; fills the tables.
+
+        Copies do not count. In the times when frames were ``taken`` (N,) in s, they have that of the frame before.
+        """
         chosen = compared_pairs(len(self.starts)) if self.rates is not None else ()
         before: tuple[int, NDArray[np.uint8]] | None = None
         changes: deque[float] = deque(maxlen=_MEMORY)  # counts, of the frames before
@@ -160,21 +169,25 @@ class VideoPasses:
                 grey = self.frames.grey(frame)
                 changed = math.inf if before is None else cv2.norm(grey, before[1], cv2.NORM_L1) / grey.size
                 usual = float(np.median(changes)) if len(changes) >= _MEMORY // 2 else 0.0
-                if grey.min() == grey.max() or changed <= _COPY * usual:
-                    faults[index] = f"frame {index} is constant{_IS_COPY}"
+                if before is not None and changed <= _COPY * usual:
+                    taken[index] = taken[before[0]]
+                    yield ()
+                    continue
+                if grey.min() == grey.max():
+                    faults[index] = f"frame {index} is constant"
                     yield ()
                     continue
                 if before is not None:
                     changes.append(changed)
                 corners = follower.next(grey, self.starts[index])
                 if before is not None:
-                    if corners is not None and before[0] == index - 1:
-                        shakes[index - 1] = shake(corners)
+                    if corners is not None and before[0] == index - 1 and index % PART_FRAMES < _CHECKED_FRAMES:
+                        checked[index - 1] = corners
                     if before[0] == index - 1 in chosen:
                         starts = self.starts[index - 1 : index + 1]
                         compared[index - 1] = followed_pair(before[1], grey, starts, self.frames.job.timing)
                     if corners is not None and self.stabilised:
-                        both = np.broadcast_to(times[[before[0], index]], corners.times.shape)
+                        both = np.broadcast_to(taken[[before[0], index]], corners.times.shape)
                         corners = replace(corners, times=both)
                 yield () if before is None else (corners,)
                 before = index, grey
@@ -223,35 +236,47 @@ class VideoPasses:
 
     # Verdict and record of a part
 
-    def shaking(self, motion: VideoMotion, first: int, frames: list[Frame]) -> dict[str, tuple[float, ...]] | None:
-        """``WindowRecord.shaking`` from frames of the output, the first of which has a number; None if unknown."""
-        measured: list[tuple[tuple[Array, float], tuple[Array, float]]] = []  # of neighbouring frames, before and after
-        follower = CornerFollower(self.frames.job.timing)
-        for number, frame in enumerate(frames, first):
-            corners, raw = follower.next(self.frames.grey(frame), self.starts[number]), motion.shakes.get(number - 1)
-            if number > first:
-                if raw is None or corners is None:
-                    break
-                measured.append((raw, shake(corners)))
-        if len(measured) < 2:
+    def shaking(self, motion: VideoMotion, tracks: list[FrameTrack]) -> dict[str, tuple[float, ...]] | None:
+        """``WindowRecord.shaking`` from frames that follow each other; None if it is unknown.
+
+        Before and after are of the same corners: in other frames, others are found, some of them on cars that pass.
+        """
+        measured: dict[int, tuple[tuple[Array, float], ...]] = {}  # of frames and the next ones, before and after
+        for pair in pairwise(tracks[:_CHECKED_FRAMES]):
+            corners = motion.corners.get(pair[0].index)
+            if corners is not None:
+                measured[pair[0].index] = shake(corners), shake(self._restored_corners(motion, pair, corners))
+        moved = {index: np.array([one for one, _ in both]) for index, both in measured.items()}  # (2, 2) px
+        changes = [moved[index + 1] - moved[index] for index in moved if index + 1 in moved]
+        if not changes:
             return None
-        changes = np.diff([[moved for moved, _ in pair] for pair in measured], axis=0)  # (pairs - 1, 2, 2) px
-        rows = np.array([[rows for _, rows in pair] for pair in measured])  # (pairs, 2) px
+        rows = np.array([[rows for _, rows in both] for both in measured.values()])  # (pairs, 2) px
         return {
             "frame_to_frame": tuple(np.sqrt(np.square(changes).sum(-1).mean(0)).tolist()),
             "rows": tuple(np.sqrt(np.square(rows).mean(0)).tolist()),
         }
 
-    def shakes_more(self, motion: VideoMotion, frames: list[tuple[FrameTrack, Frame | str]]) -> bool:
+    def _restored_corners(self, motion: VideoMotion, pair: tuple[FrameTrack, FrameTrack], corners: Corners) -> Corners:
+        """Corners between two frames where they are in the restored ones: at s if recorded at ``s + D(s, t)``."""
+        places: list[Array] = []
+        for number, track in enumerate(pair):
+            exposure = self.frames.timing_of(0, track.exposure).exposure_time
+            starts = corners.times[:, number] - motion.times[track.index] - 0.5 * exposure
+            moved = track.motion.mean_displacement(tensor(starts), exposure)
+            still = recorded = tensor(corners.places + (number - 0.5) * corners.offsets)
+            for _ in range(_ROUNDS):
+                still = recorded - displacement_at(moved, still[:, 0], still[:, 1], track.motion.camera)
+            places.append(table(still))
+        return replace(corners, places=0.5 * (places[0] + places[1]), offsets=places[1] - places[0])
+
+    def shakes_more(self, motion: VideoMotion, tracks: list[FrameTrack]) -> bool:
         """Whether frames that follow each other shake more when they are restored, or it is unknown."""
-        planes = [self.frames.restored(frame, track).planes for track, frame in frames]
-        known = [self.frames.frame(one) for one in planes if one is not None]
-        measured = self.shaking(motion, frames[0][0].index, known) if len(known) == len(frames) else None
+        measured = self.shaking(motion, tracks)
         return measured is None or any(after > before for before, after in measured.values())
 
     def verdict(self, motion: VideoMotion, frames: list[tuple[FrameTrack, Frame | str]]) -> RestorationVerdict | None:
         """Whether restoration helps, from two neighbouring frames before they are steadied; None if unknown."""
-        usable = (pair for pair in pairwise(frames) if all(track.fault is None for track, _ in pair))
+        usable = (pair for pair in pairwise(frames) if all(motion.is_usable(track.index) for track, _ in pair))
         pair = next(usable, None)
         if pair is None:
             return None
@@ -281,9 +306,8 @@ class VideoPasses:
         tracks: list[FrameTrack],
         motion: VideoMotion,
         verdict: RestorationVerdict | None,
-        first_frames: list[Frame],
     ) -> WindowRecord:
-        """The record of a part of the video, the first frames of which are given as written."""
+        """The record of a part of the video."""
         path = motion.path
         detection = self._detection(path, motion, tracks) if isinstance(path, CameraPath) else None
         left = []
@@ -307,7 +331,7 @@ class VideoPasses:
             written=len(tracks),
             left_alone=tuple(left),  # tones are removed as they were measured, whatever explains them
             error=None,
-            shaking=self.shaking(motion, tracks[0].index, first_frames),
+            shaking=self.shaking(motion, tracks),
         )
 
     def _detection(self, path: CameraPath, motion: VideoMotion, tracks: list[FrameTrack]) -> DetectedVibration:
@@ -329,7 +353,7 @@ class VideoPasses:
         velocity, acceleration = (path.derivatives(begin, order)[0, :2] for order in (1, 2))
         vibration = Vibration(amplitude, frequency, phase, velocity, acceleration)
         findings = self._findings(tones, window)
-        copies = sum(fault.endswith(_IS_COPY) for fault in motion.faults.values()) / len(times)
+        copies = np.count_nonzero(np.diff(times) == 0) / len(times)
         for code, value, allowed in (
             ("corners_unexplained", window.residual_of_most, path.allowed),
             ("frames_repeated", copies, _MAX_COPIES),

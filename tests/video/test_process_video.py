@@ -233,7 +233,7 @@ def test_tones_of_a_video_have_the_standard_deviation_of_the_row_time(clip, tmp_
         assert bool((error.abs() < 2 * getattr(found.std, name)[:, 0]).all())
 
 
-def test_copies_and_constant_frames_repeat_the_frame_before(frames, tmp_path):
+def test_constant_frames_repeat_the_frame_before(frames, tmp_path):
     changed = frames[:20].copy()
     changed[12] = 128
     write_video(tmp_path / "clip.mkv", changed, TIMES[:20], layout="rgb24", encoded="bgr0")
@@ -246,13 +246,21 @@ def test_copies_and_constant_frames_repeat_the_frame_before(frames, tmp_path):
 
 
 def test_frames_that_were_repeated_do_not_have_the_times_of_the_file(frames, tmp_path):
-    """24 frames per second, stored as 30: the encoder changes the copies."""
+    """24 frames per second, stored as 30; the encoder changes the copies."""
     source = write(tmp_path / "clip.mp4", frames[np.arange(40) * 24 // 30], options={"crf": "20", "threads": "1"})
     assert sum(np.array_equal(*pair) for pair in itertools.pairwise(pixels(source))) < 4
     report = process_video(source, tmp_path / "still.mp4", TIMING, **OPTIONS)
-    assert report.bad_frames == 7  # the first one cannot be known
+    assert report.bad_frames == 0
     for found in read_manifest(report.manifest).detections():
         assert [[one.code for one in of_axis][-1] for of_axis in found.findings] == ["frames_repeated"] * 2
+
+
+def test_copies_of_frames_are_moved_along_the_smooth_path(tmp_path):
+    source = write(tmp_path / "clip.mp4", counts_of(Shaken())[np.arange(40) * 24 // 30])
+    process_video(source, tmp_path / "steady.mp4", TIMING, border="crop", steady=1 / 3, **OPTIONS)
+    raw, steady = (shifts(pixels(path).mean(1))[5:-6, 0] for path in (source, tmp_path / "steady.mp4"))
+    assert np.sort(np.abs(raw))[4] < 0.02  # copies
+    assert np.abs(np.diff(steady)).max() < 0.3  # 0.8 with copies of restored frames
 
 
 def test_columns_that_are_read_one_after_another(frames, tmp_path):
