@@ -30,11 +30,11 @@ OPTIONS = {"restoration": {"method": "dewarp"}, "workers": 2}
 class Shaken:
     """Vibration on a slow pan with shaking along x."""
 
-    def __init__(self, amplitude=2.0, frequency=3.0):  # px, Hz
-        self.amplitude, self.frequency = amplitude, frequency
+    def __init__(self, amplitude=2.0, frequency=3.0, pan=12.0):  # px, Hz, px/s
+        self.amplitude, self.frequency, self.pan = amplitude, frequency, pan
 
     def displacement(self, t):
-        x = self.amplitude * np.sin(2 * np.pi * self.frequency * t) + 12.0 * t
+        x = self.amplitude * np.sin(2 * np.pi * self.frequency * t) + self.pan * t
         return VIBRATION.displacement(t) + np.stack([x, 0 * t], -1)
 
 
@@ -49,8 +49,8 @@ SCENE = colours((HEIGHT, WIDTH))
 STILL = np.stack([crop(channel) for channel in SCENE])
 
 
-def counts_of(motion, count=COUNT):
-    taken = [take_frames(channel, TIMING, motion, count, 0.004, seed=3) for channel in SCENE]
+def counts_of(motion, count=COUNT, scene=SCENE):
+    taken = [take_frames(channel, TIMING, motion, count, 0.004, seed=3) for channel in scene]
     return np.clip(np.round(255 * np.stack(taken, -1)), 0, 255).astype(np.uint8)
 
 
@@ -261,6 +261,17 @@ def test_copies_of_frames_are_moved_along_the_smooth_path(tmp_path):
     raw, steady = (shifts(pixels(path).mean(1))[5:-6, 0] for path in (source, tmp_path / "steady.mp4"))
     assert np.sort(np.abs(raw))[4] < 0.02  # copies
     assert np.abs(np.diff(steady)).max() < 0.3  # 0.8 with copies of restored frames
+
+
+def test_every_shot_has_its_own_smooth_path(tmp_path):
+    first, second = counts_of(Shaken())[:20], counts_of(Shaken(pan=-12.0), scene=SCENE[:, ::-1])[20:]
+    steps = []
+    for name, frames in (("first", first), ("second", second), ("both", np.concatenate([first, second]))):
+        source, sink = write(tmp_path / f"{name}.mp4", frames), tmp_path / f"{name}_steady.mp4"
+        process_video(source, sink, TIMING, border="crop", steady=1 / 3, **OPTIONS)
+        steps.append(shifts(pixels(sink).mean(1))[:, 0])
+    assert np.abs(steps[2][:19] - steps[0]).max() < 0.15  # 1.1 with one path of both shots
+    assert np.abs(steps[2][20:30] - steps[1][:10]).max() < 0.15
 
 
 def test_columns_that_are_read_one_after_another(frames, tmp_path):
