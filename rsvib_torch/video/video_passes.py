@@ -22,11 +22,10 @@ from rsvib_torch.io.full_scale import counts_to_frames
 from rsvib_torch.io.video import VideoReader
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.detected_vibration import DetectedVibration
-from rsvib_torch.motion.field import displacement_at
-from rsvib_torch.motion.sampling import recorded_offsets
+from rsvib_torch.motion.sampling import places_at_rest, recorded_offsets
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
-from rsvib_torch.numerics.tables import Array, table, tensor
+from rsvib_torch.numerics.tables import Array, tensor
 from rsvib_torch.registration.corners import CornerFollower, Corners, reduction
 from rsvib_torch.restoration import RestorationVerdict
 from rsvib_torch.results.presentation import AXIS_NAMES
@@ -43,7 +42,6 @@ from rsvib_torch.video.video_frames import Frame, FrameTrack, VideoFrames
 
 PART_FRAMES = 32  # of a part of the video, which is encoded by itself; an interrupted run repeats at most one part
 _CHECKED_FRAMES = 8  # of each part, in which the shaking is measured
-_ROUNDS = 3  # in which the place of a corner is found where roll and zoom are undone
 _AHEAD = 4  # frames decoded before they are used
 _GAIN_ERROR = 0.02  # of an amplitude: the mean over the patch of a corner is known so well (52 to 205 Hz: 0.4 to 1.6 %)
 # px^-2, of the third cumulant of the path within an exposure, by which a blurred corner is found beside the mean of the
@@ -266,16 +264,13 @@ class VideoPasses:
         }
 
     def _restored_corners(self, motion: VideoMotion, pair: tuple[FrameTrack, FrameTrack], corners: Corners) -> Corners:
-        """Corners between two frames where they are in the restored ones: at s if recorded at ``s + D(s, t)``."""
+        """Corners between two frames where they are in the restored ones."""
         places: list[Array] = []
         for number, track in enumerate(pair):
             exposure = self.frames.timing_of(0, track.exposure).exposure_time
             starts = corners.times[:, number] - motion.times[track.index] - 0.5 * exposure
-            moved = track.motion.mean_displacement(tensor(starts), exposure)
-            still = recorded = tensor(corners.places + (number - 0.5) * corners.offsets)
-            for _ in range(_ROUNDS):
-                still = recorded - displacement_at(moved, still[:, 0], still[:, 1], track.motion.camera)
-            places.append(table(still))
+            recorded = corners.places + (number - 0.5) * corners.offsets
+            places.append(places_at_rest(track.motion, recorded, starts, exposure))
         return replace(corners, places=0.5 * (places[0] + places[1]), offsets=places[1] - places[0])
 
     def shakes_more(self, motion: VideoMotion, tracks: list[FrameTrack]) -> bool:

@@ -10,6 +10,7 @@ from truth import draw_scene
 
 from rsvib_torch import FreeMotion, SensorTiming, Vibration, simulate_frames
 from rsvib_torch.motion.field import ColumnMotion, displacement_at, largest_in_frame
+from rsvib_torch.motion.sampling import places, places_at_rest, recorded_offsets
 
 TIMING = SensorTiming(row_time=8e-5, exposure_rows=20, frame_rows=300)
 ORIENTATIONS = [(-2, "forward"), (-2, "reverse"), (-1, "forward"), (-1, "reverse")]
@@ -77,3 +78,15 @@ def test_simulated_frames(scan_axis, direction):
     without = simulate_frames(torch.from_numpy(scene), timing, truth.vibration(2), 2, frame_size=(128, 148)).numpy()
     assert np.std((found - expected)[inner]) < 3e-4
     assert np.std((without - expected)[inner]) > 5 * np.std((found - expected)[inner])
+
+
+def test_places_at_rest_are_the_inverse_of_where_pixels_were_recorded():
+    timing = SensorTiming(row_time=50e-6, exposure_rows=10, frame_rows=400)
+    vibration = Vibration([8.0, 6.0, 0.02, 0.01], [60.0, 80.0, 50.0, 70.0], [0.3, 1.0, 2.0, 0.0])
+    offsets, weights = recorded_offsets(vibration, timing, (120, 160))
+    recorded = places(offsets, weights, timing, (120, 160), np.float64)[:, ::20, ::20].reshape(2, -1).T
+    row, column = np.mgrid[:120:20, :160:20].reshape(2, -1)
+    centre = np.array([79.5, 59.5])
+    still = places_at_rest(vibration, recorded - centre, recorded[:, 1] * timing.row_time, timing.exposure_time)
+    assert np.abs(recorded - np.stack([column, row], -1)).max() > 5
+    np.testing.assert_allclose(still + centre, np.stack([column, row], -1), atol=1e-3)
