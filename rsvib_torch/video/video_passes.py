@@ -248,18 +248,18 @@ class VideoPasses:
 
         Before and after are of the same corners: in other frames, others are found, some of them on cars that pass.
         """
-        measured: dict[int, tuple[tuple[Array, float], ...]] = {}  # of frames and the next ones, before and after
+        measured: dict[int, Array] = {}  # (2, 3) px, before and after: x, y and rows, of a frame and the next one
         for pair in pairwise(tracks[:_CHECKED_FRAMES]):
-            corners = motion.corners.get(pair[0].index)
-            if corners is not None:
-                measured[pair[0].index] = shake(corners), shake(self._restored_corners(motion, pair, corners))
-        moved = {index: np.array([one for one, _ in both]) for index, both in measured.items()}  # (2, 2) px
-        changes = [moved[index + 1] - moved[index] for index in moved if index + 1 in moved]
+            raw = motion.corners.get(pair[0].index)
+            if raw is not None:
+                both = shake(raw), shake(self._restored_corners(motion, pair, raw))
+                measured[pair[0].index] = np.array([[*moved, rows] for moved, rows in both])
+        changes = [measured[index + 1] - measured[index] for index in measured if index + 1 in measured]
         if not changes:
             return None
-        rows = np.array([[rows for _, rows in both] for both in measured.values()])  # (pairs, 2) px
+        moved, rows = np.array(changes)[..., :2], np.array(list(measured.values()))[..., 2]
         return {
-            "frame_to_frame": tuple(np.sqrt(np.square(changes).sum(-1).mean(0)).tolist()),
+            "frame_to_frame": tuple(np.sqrt(np.square(moved).sum(-1).mean(0)).tolist()),
             "rows": tuple(np.sqrt(np.square(rows).mean(0)).tolist()),
         }
 
@@ -357,7 +357,7 @@ class VideoPasses:
         velocity, acceleration = (path.derivatives(begin, order)[0, :2] for order in (1, 2))
         vibration = Vibration(amplitude, frequency, phase, velocity, acceleration)
         findings = self._findings(tones, window)
-        copies = np.count_nonzero(np.diff(times) == 0) / len(times)
+        copies = np.count_nonzero(np.diff(times) <= 0) / len(times)
         for code, value, allowed in (
             ("corners_unexplained", window.residual_of_most, path.allowed),
             ("frames_repeated", copies, _MAX_COPIES),
