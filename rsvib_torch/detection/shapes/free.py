@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy import linalg, special
+from scipy import linalg, sparse, special
 from torch import Tensor
 from torch.nn import functional
 
@@ -371,9 +371,7 @@ class _SplineFit:
     coefficients: Array  # (A, N) float64 px, with mean 0
     start: float  # time of the first knot in seconds
     spacing: float  # seconds between knots
-    # (K, W, W) float64 px^2 of each axis, covariances of W coefficients from the ``step`` k-th on; none while iterating
-    covariances: list[Array]
-    step: int = 1
+    covariances: list[Array]  # (N, N) float64 px^2 of the coefficients of each axis; none while iterating
     by_row_time: Array | None = None  # (A, N) px, change by the standard deviation of the row time
 
     @property
@@ -383,9 +381,7 @@ class _SplineFit:
 
     def variances(self, index: Array, weights: Array) -> Array:
         """Variances (S, F, A) of sums of ``weights`` (S, F, M) times coefficients ``index`` (S, M)."""
-        part = np.minimum(index.min(1) // self.step, len(self.covariances[0]) - 1)
-        place = index - self.step * part[:, None]
-        parts = [values[part[:, None, None], place[:, :, None], place[:, None]] for values in self.covariances]
+        parts = [covariance[index[:, :, None], index[:, None]] for covariance in self.covariances]
         variances = [((weights @ of_axis) * weights).sum(-1) for of_axis in parts]
         if self.by_row_time is not None:
             changes = [(weights * of_axis[index][:, None]).sum(-1) for of_axis in self.by_row_time]
@@ -409,7 +405,7 @@ def _fit_spline(
     if report_times is not None:
         index, weights = spline_taps(report_times, first, spacing, count)
         mean = np.bincount(index.ravel(), weights.ravel(), count) / len(report_times)
-    coefficients, covariances, step = [], [], 1
+    coefficients, covariances = [], []
     for axis in range(measurements.displacements.shape[-1]):
         # 1. The coefficients that each displacement depends on, which is a mean over the exposure and a band.
         average = measurements.average_times[min(axis, 1)] + exposure_time
@@ -424,10 +420,10 @@ def _fit_spline(
         (band,) = normal_bands(index, weights, seen, of_rows[None], count)
         # 3. Their solution.
         known = max(float(measurements.num_measurements[0, axis]), 1.0)
-        value, covariance, step = _solved_spline(band, right, energy, known, mean)
+        value, covariance = _solved_spline(band, right, energy, known, mean)
         coefficients.append(value - value.mean())
         covariances += [] if covariance is None else [covariance]
-    return _SplineFit(np.stack(coefficients), first, spacing, covariances, step)
+    return _SplineFit(np.stack(coefficients), first, spacing, covariances)
 
 
 def normal_bands(index: Array, weights: Array, seen: Array, row_weights: Array, count: int) -> Array:
@@ -457,11 +453,11 @@ def normal_bands(index: Array, weights: Array, seen: Array, row_weights: Array, 
 
 def _solved_spline(
     band: Array, right: Array, energy: float, known: float, mean: Array | None
-) -> tuple[Array, Array | None, int]:
-    """Coefficients (N,) of a smooth spline, their covariances and the step of these as in ``_SplineFit``.
+) -> tuple[Array, Array | None]:
+    """Coefficients (N,) of a smooth spline, and their covariance (N, N).
 
     ``energy`` is the weighted sum of the squared displacements, of which ``known`` are independent; ``mean`` (N,) is a
-    function of the coefficients without variance, None for no covariances.
+    function of the coefficients without variance, None for no covariance.
     """
     count = len(right)
     rounding = 1e-12 * energy  # error of the sums that make the residual energy
@@ -487,52 +483,25 @@ def _solved_spline(
 
     decade = max((10.0**power for power in range(-8, 5)), key=evidence)
     smoothness = max((decade * 10 ** (step / 3) for step in (0, -2, -1, 1, 2)), key=evidence)
-    coefficients, factor = solution(smoothness)
+    coefficients, _ = solution(smoothness)
     noise = max(energy - float(right @ coefficients), rounding) / known
     if mean is None:
-        return coefficients, None, 1
+        return coefficients, None
     if count <= 800 and noise > 0:  # the cost grows with knots^3, 20 times
-        lower = np.zeros((count, count))
-        for apart, values in enumerate(band):
-            lower[np.arange(apart, count), np.arange(count - apart)] = values[: count - apart]
-        gram = lower + np.tril(lower, -1).T
-        solved = _fit_with_spectrum(tensor(gram), tensor(right), noise, smoothness * float(scale))
+        solved = _fit_with_spectrum(_dense(band), tensor(right), noise, smoothness * float(scale))
         coefficients, covariance = map(table, solved)
-        step, covariances, of_mean = count, covariance[None], covariance @ mean
     else:
-        step, covariances = _inverse_near_diagonal(base + smoothness * scale * bend)
-        covariances *= noise
-        of_mean = noise * linalg.cho_solve_banded((factor, True), mean, check_finite=False)
+        factor = torch.linalg.cholesky(_dense(base + smoothness * scale * bend))
+        covariance = noise * table(torch.cholesky_inverse(factor))
     # the mean is taken out: c - (mean . c) instead of c
-    size = covariances.shape[1]
-    place = np.minimum(step * np.arange(len(covariances))[:, None] + np.arange(size), count - 1)
-    covariances = covariances - of_mean[place][:, None] - of_mean[place][:, :, None] + mean @ of_mean
-    return coefficients, covariances, step
+    of_mean = covariance @ mean
+    return coefficients, covariance - of_mean - of_mean[:, None] + mean @ of_mean
 
 
-def _inverse_near_diagonal(band: Array) -> tuple[int, Array]:
-    """B, and parts (K, 2 B, 2 B) of the inverse of a matrix of lower band (B, N), from the row and column k B on."""
-    width, count = band.shape
-    blocks = max(2, -(-count // width))
-    whole = np.zeros((width, (blocks + 1) * width))
-    whole[:, :count], whole[0, count:] = band, 1.0
-    row, column = np.indices((2 * width, width))
-    apart, first = row - column, width * np.arange(blocks)[:, None, None]
-    columns = np.where((apart >= 0) & (apart < width), whole[apart % width, first + column], 0.0)
-    diagonal, below = columns[:, :width], columns[:, width:]  # (K + 1, B, B)
-    diagonal = diagonal + np.tril(diagonal, -1).swapaxes(1, 2)
-    inverses = [np.linalg.inv(diagonal[-1])]
-    for k in range(blocks - 2, -1, -1):
-        inverses.append(np.linalg.inv(diagonal[k] - below[k].T @ inverses[-1] @ below[k]))
-    inverses.reverse()
-    parts, before = np.empty((blocks - 1, 2 * width, 2 * width)), inverses[0]
-    for k, part in enumerate(parts):
-        factor = inverses[k + 1] @ below[k]
-        part[:width, :width], part[width:, :width] = before, -factor @ before
-        part[:width, width:] = part[width:, :width].T
-        part[width:, width:] = inverses[k + 1] + factor @ before @ factor.T
-        before = part[width:, width:]
-    return width, parts
+def _dense(band: Array) -> Tensor:
+    """The symmetric matrix (N, N) of a lower band (D, N)."""
+    lower = sparse.dia_array((band, -np.arange(len(band))), shape=(band.shape[1],) * 2).toarray()
+    return tensor(lower + np.tril(lower, -1).T)
 
 
 def _fit_with_spectrum(gram: Tensor, right: Tensor, noise: float, smoothness: float) -> tuple[Tensor, Tensor]:
