@@ -18,8 +18,7 @@ from rsvib_torch.checks.validation import options as option_group
 from rsvib_torch.checks.values import check_single
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.grouped_frames import grouped_frames
-from rsvib_torch.detection.shapes.free import residual_of_motion, rms_motion, start_curve
-from rsvib_torch.detection.start import measurements_of_curve
+from rsvib_torch.detection.shapes.free import record_of, residual_of_motion, rms_motion, start_of_stack
 from rsvib_torch.detection.verdict import recording_reasons
 from rsvib_torch.execution.precision import full_precision, without_gradients
 from rsvib_torch.frames.entry_points import entry_point
@@ -249,11 +248,10 @@ def align_motion(
             fit_focal_length=options.camera is None or options.fit_gain,
             fit_row_time=options.fit_row_time,
         )
-    bands = options.bands()
-    rowwise, curve, (first, last) = start_curve(stack, timing, bands)
+    rowwise, start = start_of_stack(stack, timing, options.bands())
+    measured, (first, last) = start.measurements, record_of(stack, rowwise)
     turned = recorded.to_row_order(timing).to("cpu")
     low, high = offset_range(turned.start, turned.end, first, last, options.offsets)
-    measured = measurements_of_curve(curve, rowwise, bands.band_step)
     offset, other = best_offset(measured, turned, low, high, rowwise)
     clock = FittedClock(offset + 0.5 * (first + last), 1.0, (1.0, 1.0), (0.0, 0.0), 0.5 * (first + last))
     clock, _ = fit_clock(measured, turned, clock, False, options.fit_gain)

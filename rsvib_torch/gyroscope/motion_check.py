@@ -13,8 +13,7 @@ from torch import Tensor
 
 from rsvib_torch.checks.values import check_single, described
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.shapes.free import start_curve
-from rsvib_torch.detection.start import measurements_of_curve
+from rsvib_torch.detection.shapes.free import start_of_stack
 from rsvib_torch.execution.precision import full_precision, without_gradients
 from rsvib_torch.frames.entry_points import entry_point
 from rsvib_torch.frames.grey import grey_frames
@@ -122,8 +121,7 @@ def check_motion(frames: FramesOrFiles, timing: SensorTiming, motion: Motion, op
     check_single("motion", motion)
     if stack.batched:
         raise ValueError("check_motion takes one stack, not a batch")
-    rowwise, curve, _ = start_curve(stack, timing, options)
-    measured = measurements_of_curve(curve, rowwise, options.band_step)
+    measured = start_of_stack(stack, timing, options)[1].measurements
     turned = motion.to("cpu").to_row_order(timing)
     offsets = _offsets(tensor(measured.displacements))
     residual = offsets - _offsets(_averaged(turned, measured))

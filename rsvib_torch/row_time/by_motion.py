@@ -14,6 +14,7 @@ from rsvib_torch.checks.validation import Number, Positive
 from rsvib_torch.checks.validation import options as option_group
 from rsvib_torch.checks.values import check_number
 from rsvib_torch.detection.shapes.free import measure_freely, residual_of_motion
+from rsvib_torch.detection.start import band_start
 from rsvib_torch.execution.parallel import threads_for
 from rsvib_torch.execution.precision import full_precision, without_gradients
 from rsvib_torch.frames.entry_points import entry_point
@@ -165,11 +166,8 @@ def _measured_freely(
     """Displacements of rows, measured around a motion of any shape, which any assumed row time allows."""
     # the blanking time, over which the spline continues, is half of the period
     timing = clock.timing(0.5 * clock.period / clock.num_rows)
-    starts = timing.frame_starts(stack.images.shape[1], stack.images.device)
-    record = (0.0, float(starts[-1]) + clock.num_rows * timing.row_time + timing.exposure_time)
-    times = starts[:, None] + curve.rows * timing.row_time
-    curve = replace(curve, times=times[:-1], later_times=times[1:])
-    rows, motion, _ = measure_freely(stack, timing, curve, record, options, 24, 4)
+    start = band_start(stack, timing, options, curve, mere_start=True)
+    rows, motion = measure_freely(stack, timing, start.measurements, 24, 4)
     measured = rows.measurements.reweighted(residual_of_motion(rows.measurements, motion[0]))
     residual = residual_of_motion(measured, motion[0])
     measured = replace(measured, independent=measured.independent_fraction(residual))

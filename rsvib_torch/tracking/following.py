@@ -17,7 +17,7 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.detection.shapes.free import start_curve
+from rsvib_torch.detection.shapes.free import start_of_stack
 from rsvib_torch.detection.tones.fit import residual_of
 from rsvib_torch.detection.verdict import Findings, scene_reasons
 from rsvib_torch.execution.parallel import threads_for
@@ -160,7 +160,8 @@ def follow_vibration(frames: FramesOrFiles, timing: SensorTiming, options: Follo
 
 
 def _followed(stack: GreyFrames, options: FollowOptions) -> FollowedVibration:
-    rows, curve, _ = start_curve(stack, stack.timing, _BANDS)
+    rows, start = start_of_stack(stack, stack.timing, _BANDS)
+    curve = start.curve
     against = scene_reasons(curve, stack.images.shape[-1])[0]
     if against:
         raise ValueError(str(against[0]))

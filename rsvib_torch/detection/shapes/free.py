@@ -9,6 +9,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -27,7 +28,7 @@ from rsvib_torch.detection.rows.grouped_frames import (
     grouped_strips,
 )
 from rsvib_torch.detection.sensitivity import displacements_by_row_time
-from rsvib_torch.detection.start import band_curve, measurements_of_curve
+from rsvib_torch.detection.start import BandStart, band_start
 from rsvib_torch.detection.strips import FieldScale, camera_in_row_order
 from rsvib_torch.detection.verdict import rotation_reasons, scene_reasons
 from rsvib_torch.execution.chunking import runs
@@ -45,7 +46,6 @@ from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.numerics.splines import gauss_legendre, spline_taps
 from rsvib_torch.numerics.tables import Array, table, tensor
 from rsvib_torch.options import FreeMotionOptions, RegistrationOptions
-from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.results.presentation import AXIS_NAMES, JudgedResult, axis_rows, verdict_table
 from rsvib_torch.results.reason import Reason
 from rsvib_torch.text import measured_text
@@ -179,13 +179,14 @@ def detect_motion(frames: FramesOrFiles, timing: SensorTiming, options: FreeMoti
 def _detect(stack: GreyFrames, timing: SensorTiming, options: FreeMotionOptions, scale: FieldScale) -> MotionDetection:
     """``detect_motion`` of one stack."""
     # 1. The rows, measured around a spline, and their weights.
-    rowwise, curve, record = start_curve(stack, timing, options)
+    rowwise, start = start_of_stack(stack, timing, options)
+    record = record_of(stack, rowwise)
     longest, knot_rows = math.floor((record[1] - record[0]) / rowwise.row_time), options.knot_rows
     if knot_rows > longest:
         raise ValueError(f"knot_rows must be at most {longest}, the row times of the stack, got {knot_rows}")
-    rows, motion, spacing = measure_freely(stack, rowwise, curve, record, options, knot_rows, options.iterations)
+    rows, motion = measure_freely(stack, rowwise, start.measurements, knot_rows, options.iterations)
     if not scale.same_for_all_columns:
-        rows, motion = _measure_field(stack, rowwise, motion, spacing, record, scale, options.iterations)
+        rows, motion = _measure_field(stack, rowwise, motion, scale, options.iterations)
     measured = rows.measurements
     residual = residual_of_motion(measured, motion[0])
     weighed = measured.reweighted(residual)
@@ -195,32 +196,25 @@ def _detect(stack: GreyFrames, timing: SensorTiming, options: FreeMotionOptions,
     starts = rowwise.frame_starts(stack.images.shape[1])
     rows_of_report = np.linspace(0, scale.height - 1, min(32, scale.height))
     times = starts[:, None] + tensor(rows_of_report) * rowwise.row_time + 0.5 * rowwise.exposure_time
-    fit = _fit_spline(weighed, spacing, record, table(times).ravel())
+    fit = _fit_spline(weighed, motion.spacing, record, table(times).ravel())
     if rowwise.row_time_std:
         by_row_time = displacements_by_row_time(measured, motion[0], rowwise, len(starts))
         changed = replace(weighed, displacements=weighed.displacements + by_row_time)
-        other = _fit_spline(changed, spacing, record, table(times).ravel())
+        other = _fit_spline(changed, motion.spacing, record, table(times).ravel())
         fit = replace(fit, by_row_time=other.coefficients - fit.coefficients)
     motion = _motion(fit, (0.25 * scale.width, 0.25 * scale.height))  # px; beyond, frames share too little
     # 3. The row bands, which may contradict the motion of the middle column.
-    banded = measurements_of_curve(curve, rowwise, options.band_step)
     of_middle: Motion = motion
     if not scale.same_for_all_columns:
         middle = torch.zeros(1, dtype=torch.float64, device="cpu")
         of_middle = ColumnMotion.of_columns(scale.free_motion(motion), middle, rowwise, len(starts), scale.height)
-    of_bands = bands_reasons(curve, scale.width, banded, of_middle[0], scale.axes)
+    of_bands = bands_reasons(start, scale.width, of_middle[0], scale.axes)
     report = _report(motion[0], fit, measured, timing, times, scale, of_bands, rows.differential()[0])
     return report.to(stack.images.device)
 
 
 def _measure_field(
-    stack: GreyFrames,
-    timing: RowTiming,
-    start: FreeMotion,
-    spacing: float,
-    record: tuple[float, float],
-    scale: FieldScale,
-    iterations: int,
+    stack: GreyFrames, timing: RowTiming, start: FreeMotion, scale: FieldScale, iterations: int
 ) -> tuple[MeasuredRows, FreeMotion]:
     """``measure_freely`` with roll and zoom, from a motion without them; all components in px."""
     still = torch.zeros_like(start.coefficients[:, :1]).expand(-1, scale.axes - 2, -1)
@@ -233,26 +227,28 @@ def _measure_field(
         return grouped_strips(stack.images, stack.valid, timing, motion, scale, pairs=False)
 
     # strips follow the size of roll and zoom, which are unknown in the first round
-    rows, motion = _rounds(strips_for(motion), motion, spacing, record, 1)
-    if iterations == 1:
-        return rows, motion
-    return _rounds(strips_for(motion), motion, spacing, record, iterations - 1, weighted=True)
+    return _rounds(strips_for, motion, start.spacing, record_of(stack, timing), iterations, grouped_in=(0, 1))
 
 
 def _rounds(
-    rows: GroupedFrames,
+    grouped: Callable[[FreeMotion], GroupedFrames],
     motion: FreeMotion,
     spacing: float,
     record: tuple[float, float],
     count: int,
     *,
-    weighted: bool = False,
+    grouped_in: tuple[int, ...] = (0,),
 ) -> tuple[MeasuredRows, FreeMotion]:
-    """Rounds of measuring the rows of one stack around a spline and fitting it to them, ``weighted`` in all of them."""
+    """Rounds of measuring the rows of one stack around a spline and fitting it to them.
+
+    The frames are ``grouped`` for the motion before some of the rounds.
+    """
     for number in range(count):
+        if number in grouped_in:
+            rows = grouped(motion)
         measured = rows.measure(motion.to(rows.groups[0].starts.device), keep_images=False)
         measurements = measured.measurements
-        if number or weighted:
+        if number:
             measurements = measurements.reweighted(residual_of_motion(measurements, motion[0]))
         # while iterating, any drift is an image motion, which the scene rows of the groups follow
         motion = _motion(_fit_spline(measurements, spacing, record))
@@ -260,42 +256,41 @@ def _rounds(
 
 
 def measure_freely(
-    stack: GreyFrames,
-    timing: RowTiming,
-    curve: OffsetCurve,
-    record: tuple[float, float],
-    bands: RegistrationOptions,
-    knot_rows: int,
-    iterations: int,
-) -> tuple[MeasuredRows, FreeMotion, float]:
-    """The rows of one stack around a spline, the spline (a batch of one), and its knot spacing in seconds."""
+    stack: GreyFrames, timing: RowTiming, banded: Measurements, knot_rows: int, iterations: int
+) -> tuple[MeasuredRows, FreeMotion]:
+    """The rows of one stack around a spline, and the spline (a batch of one), from measurements of row bands."""
+    record = record_of(stack, timing)
     spacing = max(knot_rows * timing.row_time, (record[1] - record[0]) / 3000)  # the cost grows with knots^3
-    banded = measurements_of_curve(curve, timing, bands.band_step)
-    motion = _motion(_fit_spline(banded, max(spacing, 0.5 * bands.band_rows * timing.row_time), record))
-    rows = grouped_frames(stack.images, stack.valid, timing, motion.to(stack.images.device))
-    return *_rounds(rows, motion, spacing, record, iterations), spacing
+    motion = _motion(_fit_spline(banded, max(spacing, 0.5 * banded.average_times[0]), record))
+
+    def groups_for(motion: FreeMotion) -> GroupedFrames:
+        return grouped_frames(stack.images, stack.valid, timing, motion.to(stack.images.device))
+
+    return _rounds(groups_for, motion, spacing, record, iterations)
 
 
-def start_curve(
-    stack: GreyFrames, timing: SensorTiming, bands: RegistrationOptions
-) -> tuple[RowTiming, OffsetCurve, tuple[float, float]]:
-    """Timing in row order, the offsets of the row bands of one stack, start and end of the record in seconds.
+def start_of_stack(stack: GreyFrames, timing: SensorTiming, bands: RegistrationOptions) -> tuple[RowTiming, BandStart]:
+    """Timing in row order, and the offsets of the row bands of one stack.
 
     An error if the frames do not fit the timing, or fewer than a quarter of the bands are found.
     """
-    frames = stack.images
     rowwise = timing.in_row_order()
-    rowwise.check_rows(frames.shape[-2])
-    curve = band_curve(frames, stack.valid, rowwise, bands, mere_start=True)
-    share = float(curve.good.double().mean())
+    rowwise.check_rows(stack.images.shape[-2])
+    start = band_start(stack, rowwise, bands, None, mere_start=True)
+    share = float(start.curve.good.double().mean())
     if share < 0.25:
         raise ValueError(
             f"only {share:.0%} of the row bands are found in the next frame: the motion exceeds "
             f"search={bands.search} px within a frame (use a larger search), or the frames show different scenes"
         )
-    starts = rowwise.frame_starts(frames.shape[1])
-    end = float(starts[-1]) + frames.shape[-2] * rowwise.row_time + rowwise.exposure_time
-    return rowwise, curve, (float(starts[0]), end)
+    return rowwise, start
+
+
+def record_of(stack: GreyFrames, timing: RowTiming) -> tuple[float, float]:
+    """Start and end in s of the exposures of a stack."""
+    num_frames, num_rows = stack.images.shape[1:3]
+    starts = timing.frame_starts(num_frames)
+    return float(starts[0]), float(starts[-1]) + num_rows * timing.row_time + timing.exposure_time
 
 
 def residual_of_motion(measured: Measurements, motion: Motion) -> Array:
@@ -327,20 +322,18 @@ def _offsets_of_bands(banded: Measurements, displacements: Array) -> Array:
     return np.diff(displacements[0], axis=1)[banded.weights[0].min(-1) > 0, 0]
 
 
-def bands_reasons(
-    curve: OffsetCurve, columns: int, banded: Measurements, motion: Motion, axes: int = 2
-) -> list[list[Reason]]:
-    """Reasons against a motion of each axis in row order that the row bands of one stack contradict.
+def bands_reasons(start: BandStart, columns: int, motion: Motion, axes: int = 2) -> list[list[Reason]]:
+    """Reasons against a motion of each axis in row order that the row bands of one stack of ``columns`` px contradict.
 
-    Noise without a scene has offsets of any size, and rows that are measured around a fit to them confirm it. The
-    measurements ``banded`` are those of the curve, of frames of ``columns`` px.
+    Noise without a scene has offsets of any size, and rows that are measured around a fit to them confirm it.
     """
+    banded = start.measurements
     values = _offsets_of_bands(banded, banded.displacements)
     size = np.abs(values - values.mean(0)).mean(0).tolist()
     allowed = [max(MAX_BAND_ERROR, 0.3 * axis) for axis in size]  # px
     compared = zip(AXIS_NAMES, band_errors(banded, motion), allowed, strict=False)
     against = [[Reason("bands_contradict", *of_axis)] if of_axis[1] > of_axis[2] else [] for of_axis in compared]
-    of_all = scene_reasons(curve, columns)[0]
+    of_all = scene_reasons(start.curve, columns)[0]
     return [of_all + of_axis for of_axis in [*against, [], []][:axes]]
 
 

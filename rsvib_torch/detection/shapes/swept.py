@@ -17,12 +17,12 @@ from rsvib_torch.detection.shapes.free import (
     MAX_BAND_ERROR,
     band_errors,
     bands_reasons,
+    record_of,
     residual_of_motion,
     rms_motion,
-    start_curve,
+    start_of_stack,
     unexplained_reasons,
 )
-from rsvib_torch.detection.start import measurements_of_curve
 from rsvib_torch.detection.tones.fit import MIN_GAIN, offset_gain
 from rsvib_torch.detection.tones.periodogram import explained_power
 from rsvib_torch.detection.verdict import MAX_DISPLACEMENT_STD
@@ -201,15 +201,15 @@ def _detect(
 ) -> _Fitted:
     """Fit of one stack."""
     # 1. Start from the row bands.
-    rowwise, curve, record = start_curve(stack, timing, options)
-    banded = measurements_of_curve(curve, rowwise, options.band_step)
+    rowwise, start = start_of_stack(stack, timing, options)
+    record, banded = record_of(stack, rowwise), start.measurements
     highest = 0.5 / (options.band_rows * rowwise.row_time)
-    (num_frames, _, width), pairs, device = stack.images.shape[1:], curve.quality.shape[1], stack.images.device
+    (num_frames, _, width), pairs, device = stack.images.shape[1:], start.curve.quality.shape[1], stack.images.device
     starts = []
     for axis in range(2):
         starts.append(_start(banded, axis, pairs, record, highest))
         step_done()
-    fits = torch.stack([start[0] for start in starts])
+    fits = torch.stack([of_axis[0] for of_axis in starts])
 
     # 2. Rounds of measuring and fitting.
     def motion_of(values: Tensor) -> FreeMotion:
@@ -220,9 +220,9 @@ def _detect(
         motion = motion_of(fits)
         measured = frames.measure(motion.expanded(1).to(device), keep_images=False).measurements
         weighed = measured.reweighted(residual_of_motion(measured, motion))
-        starts = [_with_aliases(start, (record[1] - record[0]) / num_frames) for start in starts]
+        starts = [_with_aliases(of_axis, (record[1] - record[0]) / num_frames) for of_axis in starts]
         starts = [_settle(weighed, axis, record, starts[axis])[0][:4] for axis in range(2)]
-        fits = torch.stack([start[0] for start in starts])
+        fits = torch.stack([of_axis[0] for of_axis in starts])
         step_done()
 
     # 3. The last fit, its uncertainty, and what else the rows agree with.
@@ -245,7 +245,7 @@ def _detect(
     variances = torch.einsum("angi,aij,angj->ang", columns, covariances, columns).clamp(min=0.0)
 
     # 4. Reasons from the row bands.
-    against = bands_reasons(curve, width, banded, motion)
+    against = bands_reasons(start, width, motion)
     chance = _chance(banded, motion, pairs, _STARTS * ((record[1] - record[0]) * highest) ** 2)
     for axis, error in enumerate(band_errors(banded, motion)):
         if error > MAX_BAND_ERROR and chance[axis] > _MAX_CHANCE:
