@@ -245,6 +245,11 @@ class Measurements:
         actual = np.square(weight * z).sum((1, 2)) / np.maximum(np.square(slope.sum((1, 2))), 1e-300)
         return np.minimum(apparent / np.maximum(actual, 1e-300), 1.0)
 
+    def weighed(self, residual: Array) -> "Measurements":
+        """The measurements of the last fit: ``reweighted``, with the fraction that counts for its covariance."""
+        weighed = self.reweighted(residual)
+        return replace(weighed, independent=weighed.independent_fraction(residual) * self.share_counted(residual))
+
     def _biweight_argument(self, residual: Array) -> Array:
         """(B, N, 2) rms residual over 6 robust standard deviations (98 % efficient), at most 1; 1 if not measured."""
         size = self._sizes_for_weights(residual)

@@ -373,9 +373,7 @@ def conclude(frames: GroupedFrames, measured: MeasuredRows, fit: ToneFit) -> Fit
     """The exact fit to the measurements themselves, with a covariance that accounts for correlated residuals."""
     measurements = measured.measurements
     residual = residual_of(measurements, fit)
-    weighted = measurements.reweighted(residual)
-    share = weighted.independent_fraction(residual) * measurements.share_counted(residual)
-    weighted = replace(weighted, independent=share)
+    weighted = measurements.weighed(residual)
     fit = fitted_again(weighted, fit)
     tones = model_displacements(measurements, replace(fit, drift=np.zeros_like(fit.drift)))
     other = OtherMotion.of(measurements, tones, residual, measured.differential())

@@ -152,7 +152,7 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
 
     @classmethod
     def stacked(cls, motions: Sequence["FreeMotion"]) -> "FreeMotion":
-        """Motions with the same knots and number of tones as a batch; the new dimension is the first."""
+        """Motions with the same knots as a batch; the new dimension is the first."""
         if len(motions) == 0:
             raise ValueError("motions must contain at least one motion")
         first = motions[0]

@@ -222,7 +222,9 @@ class Vibration(
 
     @classmethod
     def stacked(cls, vibrations: Sequence["Vibration"]) -> "Vibration":
-        """Vibrations with the same shape and camera as a batch; the new dimension is the first.
+        """Vibrations with the same axes and camera as a batch; the new dimension is the first.
+
+        Those with fewer tones have further ones of amplitude 0.
 
         Example:
             >>> Vibration.stacked([Vibration(2.0, 50.0), Vibration(3.0, 40.0)]).amplitude.shape
@@ -233,9 +235,15 @@ class Vibration(
         first = vibrations[0]
         if any(one.camera != first.camera for one in vibrations):
             raise ValueError("motions of different cameras cannot be stacked")
-        if len({one.amplitude.shape for one in vibrations}) > 1:
+        if len({one.amplitude.shape[:-1] for one in vibrations}) > 1:
             raise ValueError(f"vibrations differ in shape: {sorted({tuple(v.amplitude.shape) for v in vibrations})}")
-        values = {name: torch.stack([getattr(one, name) for one in vibrations]) for name in _LIMITS}
+        count = max(one.amplitude.shape[-1] for one in vibrations)
+        values = {}
+        for name in _LIMITS:
+            parts = [getattr(one, name) for one in vibrations]
+            if name not in _POLYNOMIAL:
+                parts = [functional.pad(part, (0, count - part.shape[-1])) for part in parts]
+            values[name] = torch.stack(parts)
         return cls(**values, camera=first.camera)
 
     def scaled(self, factor: Tensor | float) -> "Vibration":

@@ -15,11 +15,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy import linalg, sparse, special
+from scipy import linalg, sparse
 from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
 from rsvib_torch.detection.rows.grouped_frames import (
     GroupedFrames,
     GroupedStrips,
@@ -30,6 +31,9 @@ from rsvib_torch.detection.rows.grouped_frames import (
 from rsvib_torch.detection.sensitivity import displacements_by_row_time
 from rsvib_torch.detection.start import BandStart, band_start
 from rsvib_torch.detection.strips import FieldScale, camera_in_row_order
+from rsvib_torch.detection.tones.fit import fitted_again, motion_of_fit, residual_of
+from rsvib_torch.detection.tones.selection import find_tones, with_best_aliases
+from rsvib_torch.detection.tones.uncertainty import with_further_tones
 from rsvib_torch.detection.verdict import rotation_reasons, scene_reasons
 from rsvib_torch.execution.chunking import runs
 from rsvib_torch.execution.parallel import threads_for
@@ -189,9 +193,7 @@ def _detect(stack: GreyFrames, timing: SensorTiming, options: FreeMotionOptions,
         rows, motion = _measure_field(stack, rowwise, motion, scale, options.iterations)
     measured = rows.measurements
     residual = residual_of_motion(measured, motion[0])
-    weighed = measured.reweighted(residual)
-    share = weighed.independent_fraction(residual) * measured.share_counted(residual)
-    weighed = replace(weighed, independent=share)
+    weighed = measured.weighed(residual)
     # 2. The last fit, with its uncertainty at the middles of exposures of up to 32 rows of each frame.
     starts = rowwise.frame_starts(stack.images.shape[1])
     rows_of_report = np.linspace(0, scale.height - 1, min(32, scale.height))
@@ -550,18 +552,20 @@ def _report(
     ``of_bands`` are the reasons of each axis from the row bands, ``apart`` (2,) px the rms difference of the
     displacements along a row that the motion does not explain.
     """
-    # 1. Standard deviations of the spline; and what it does not contain: a tone that displaces all frames nearly
-    # equally, and motion that is faster than the knots.
+    # 1. Standard deviations of the spline, or of tones that explain the rows as well; and what neither contains: motion
+    # that is faster than the knots.
     index, weights = spline_taps(table(times).ravel(), fit.start, fit.spacing, fit.coefficients.shape[-1])
     std = tensor(np.sqrt(fit.variances(index, weights[:, None]))[:, 0]).unflatten(0, times.shape)
     of_visible, of_common = _visible_and_common(fit, measured)
+    of_spline = table(std.square().mean((0, 1)).sqrt())
+    motion, has_tones, further = _with_tones(motion, measured, timing, times, of_spline, of_visible)
     value, residual = motion.displacement(times), residual_of_motion(measured, motion)
     value = value - value.mean((0, 1))
-    blind = _blind_tone(table(value), table(times), of_visible)
     sudden = tensor(_sudden(measured, residual, table(times), fit.spacing))
-    std = torch.hypot(torch.hypot(std, tensor(blind)), sudden)
+    std = torch.hypot(torch.hypot(torch.where(torch.from_numpy(has_tones), 0.0, std), tensor(further)), sudden)
     std_seen = torch.hypot(tensor(of_visible), sudden.square().mean((0, 1)).sqrt())
-    unseen, rest = tensor(np.hypot(of_common, blind)), tensor(measured.unexplained(residual)[0])
+    unseen = tensor(np.hypot(np.where(has_tones, 0.0, of_common), further))
+    rest = tensor(measured.unexplained(residual)[0])
     # 2. The verdict.
     moved = (value - value.mean(0)).square().mean((0, 1)).sqrt()
     findings = []
@@ -603,58 +607,57 @@ def _sudden(measured: Measurements, residual: Array, times: Array, spacing: floa
     return np.sqrt(np.where(local > _SUDDEN * usual, local, 0.0))
 
 
-# px, standard deviation of the quadratures of a nearly blind tone before it is measured: vibrations have a few pixels
-_BLIND_SIZE = 3.0
-# of the energy of the visible motion. 200 such tones in five frames left 3e-5 to 7e-3 of it, as many walks and smooth
-# motions 0.26 and more, sums of three tones 0.19 and more, but one 0.04
-_LEFT_BY_BLIND = 0.05
+# rms difference of the displacements of rows by tones from those by a spline, over their standard deviation. Of 240
+# axes of random walks and smooth motions in five frames, tones were at least 2.0 apart, of 70 axes with the right tones
+# at most 1.1
+_MAX_APART = 1.3
+# frames beyond the number of tones of an axis that may take the place of a spline: three tones agreed with a random
+# walk in two frames and were wrong by 21 px, with a standard deviation of 0.1 px
+_FRAMES_BESIDE = 2
 
 
-def _blind_tone(values: Array, times: Array, noise: Array) -> Array:
-    """(A,) px, rms of the displacement common to all frames by a tone near a multiple of the frame rate, or 0.
+def _with_tones(
+    motion: FreeMotion, measured: Measurements, timing: SensorTiming, times: Tensor, std: Array, of_visible: Array
+) -> tuple[FreeMotion, Array, Array]:
+    """The motion with tones in place of the spline, on axes whose rows these explain as well.
 
-    Of a tone at ``1 + e`` times the frame rate, the frames show ``2 pi e`` of its amplitude, and e only in the change
-    of that from frame to frame. The rms displacement is the mean over all e of its posterior, where such a tone beside
-    a uniformly accelerated motion explains the visible one. Of 400 displacements by tones of 1.5 px within 8 % of the
-    frame rate in five frames, 94 % of the 95 % intervals contain the truth. ``values`` (T, R, A) px are displacements
-    at ``times`` (T, R) in s, ``noise`` (A,) px is the standard deviation of their visible part.
+    The spline has a smooth power spectrum, in which a tone near a multiple of the frame rate, which the frames hardly
+    show, is nearly missing. A few tones that agree with the same rows are the simpler explanation, and determine also
+    what all frames have in common. The spline is kept where they are more uncertain than they differ from it, and where
+    the frames are too few, so that different tones agree.
+
+    ``std`` (A,) px is the standard deviation of the spline in all rows, ``of_visible`` (A,) px that of the motion
+    between frames. The results are the motion, the axes (A,) with tones, and (A,) px the standard deviation of the
+    tones, or their difference from a spline that is kept; 0 without tones that agree.
     """
-    starts = times[:, 0]
-    period, frames = np.diff(starts).mean(), len(starts)
-    largest = np.zeros(values.shape[-1])
-    # the change within three frames is that of an acceleration; unequal intervals have no blind tone
-    if frames < 4 or np.ptp(np.diff(starts)) > 0.01 * period:
-        return largest
-    turns = (times - times.mean()) / period
+    # 1. The tones of the rows, and their standard deviation with the allowance for a further one.
+    residual = residual_of_motion(measured, motion)
+    interval = max(BLOCK_ROWS * timing.row_time, 0.5 * timing.exposure_time)
+    rows = replace(measured, independent=measured.independent_fraction(residual))
+    single = find_tones(rows, interval, 1)
+    for _ in range(2):  # the other side of a multiple of the frame rate, and then of another multiple
+        single = with_best_aliases(rows, single, 0.0, 1.0)
+    fit = find_tones(rows, interval, start=single, least_gain=0.02)
+    weighed = measured.weighed(residual_of(measured, fit))
+    fit = fitted_again(weighed, fit)
+    starts = table(times - 0.5 * timing.exposure_time).ravel()
+    of_tones = with_further_tones(weighed, fit, starts)[1].displacement_std[0]
+    # 2. The axes on which they agree with the spline, and the difference in all rows.
+    apart = (residual_of(measured, fit) - residual)[0][measured.visible[0] > 0]
+    number = fit.active[0].sum(-1)
+    agree = (number > 0) & (np.sqrt(np.square(apart).mean(0)) < _MAX_APART * of_visible)
 
-    def visible(functions: Array) -> Array:
-        """Functions (T, R, ...) of the displacement less their means over the frames, as columns (T R, ...)."""
-        return (functions - functions.mean(0)).reshape(-1, *functions.shape[2:])
+    def replaced(axes: Array) -> FreeMotion:
+        """The motion with tones and a straight line instead of the spline of some axes."""
+        tones, knots = motion_of_fit(replace(fit, active=fit.active & axes[:, None]))[0], motion.knots
+        speed = motion.tones.image_motion
+        line = (tones.image_motion - speed)[:, None] * (knots - knots.mean())
+        coefficients = torch.where(torch.from_numpy(axes)[:, None], line, motion.coefficients)
+        return FreeMotion(coefficients, motion.start, motion.spacing, replace(tones, image_motion=speed))
 
-    # 1. The visible motion without a uniformly accelerated one.
-    drift, _ = np.linalg.qr(visible(np.stack([turns, np.square(turns)], -1)))
-    left = visible(values)
-    left = left - drift @ (drift.T @ left)
-    energy = np.square(left).sum(0)
-    distances = np.linspace(-0.75, 0.75, 61) / frames
-    for multiple in range(1, 7):
-        # 2. Fits (E, 2, A) of tones of all e, and the variance of their measurements, of which a third is independent.
-        angle = 2 * math.pi * (multiple + distances) * turns[..., None]
-        waves = visible(np.stack([np.cos(angle), np.sin(angle)], -1)).swapaxes(0, 1)  # (E, T R, 2)
-        waves = waves - drift @ (drift.T @ waves)
-        gram, right = waves.mT @ waves, waves.mT @ left
-        unexplained = energy - (right * np.linalg.solve(gram + 1e-9 * np.eye(2), right)).sum(1).max(0)
-        variance = 3 * np.maximum(np.square(noise), unexplained / len(left))
-        # 3. Posterior of the quadratures for each e, its evidence, and the mean square of the displacement.
-        for axis in np.flatnonzero(unexplained < _LEFT_BY_BLIND * energy):
-            precision = gram / variance[axis] + np.eye(2) / _BLIND_SIZE**2
-            covariance = np.linalg.inv(precision)
-            target = right[..., axis] / variance[axis]
-            mean = (covariance @ target[..., None])[..., 0]
-            evidence = 0.5 * (target * mean).sum(-1) - 0.5 * np.linalg.slogdet(precision)[1]
-            squares = np.square(mean).sum(-1) + np.trace(covariance, axis1=1, axis2=2)
-            largest[axis] = max(largest[axis], math.sqrt(0.5 * special.softmax(evidence) @ squares))
-    return largest
+    difference = table(replaced(agree).displacement(times) - motion.displacement(times)).std((0, 1))
+    taken = agree & ((of_tones < std) | (2 * of_tones < difference)) & (number <= len(times) - _FRAMES_BESIDE)
+    return replaced(taken), taken, np.where(taken, of_tones, difference)
 
 
 def _visible_and_common(fit: _SplineFit, measured: Measurements) -> tuple[Array, Array]:

@@ -54,32 +54,37 @@ def robust_fit(
 _ALIASES, _WRONG_SIZE = 2, 3.0  # frequencies on either side; standard deviations of a typical row
 
 
-def with_best_aliases(measurements: Measurements, fit: ToneFit) -> ToneFit:
-    """One tone of each axis, of the frequency ``f + k / T`` that leaves the smallest residual; without covariance.
+def with_best_aliases(
+    measurements: Measurements, fit: ToneFit, wrong_size: float = _WRONG_SIZE, most_left: float = 0.5
+) -> ToneFit:
+    """One tone of each axis, of the frequency ``|k / T + f|`` that leaves the smallest residual; without covariance.
 
-    Tones that are a multiple of 1 / T apart, T the interval of the frames, differ within a frame only. Bands may
-    confuse them: in 7 of 72 stacks of 6 to 8 frames, a tone of 90.5 Hz was taken for one of 30.2 Hz, and further tones
-    explained the difference, so that the axis was reliable and wrong. The measurements are of rows, the fit has one
-    tone of each axis; stacks with a small residual are not changed.
+    Tones that are a multiple of 1 / T apart, T the interval of the frames, or on both sides of one, differ within a
+    frame only. Bands may confuse them: in 7 of 72 stacks of 6 to 8 frames, a tone of 90.5 Hz was taken for one of 30.2
+    Hz, and further tones explained the difference, so that the axis was reliable and wrong. The measurements are of
+    rows, the fit has one tone of each axis. Others are tried on axes whose typical residual exceeds ``wrong_size``
+    standard deviations, and taken where less than the fraction ``most_left`` of the residual is left.
     """
     size = without_nan(median(measurements.sizes(residual_of(measurements, fit)), 1), 0.0)  # (B, A)
-    wrong = (size > _WRONG_SIZE) & fit.active[..., 0]
+    wrong = (size > wrong_size) & fit.active[..., 0]
     if fit.model.harmonics > 1 or not bool(wrong.any()):
         return fit
     parameters = fit.parameters[0].size
     fit = replace(fit, covariance=np.zeros((len(size), parameters, parameters)))
-    steps = np.arange(-_ALIASES, _ALIASES + 1)
+    steps = np.repeat(np.arange(-_ALIASES, _ALIASES + 1), 2)
+    signs = np.tile([1.0, -1.0], len(steps) // 2)
     for axis in np.flatnonzero(wrong.any(0)):
         # 1. The aliases of the tone of this axis, each fitted roughly.
         (index,) = wrong[:, axis].nonzero()
         tried = np.repeat(index, len(steps))
         some, frequencies = take_stacks([measurements], tried), fit.frequencies[tried]
-        moved = frequencies[:, axis, 0] + (steps / measurements.interval[index, None]).ravel()
-        frequencies[:, axis, 0] = np.where(moved > 0, moved, frequencies[:, axis, 0])
+        frequencies[:, axis, 0] = np.abs(
+            (signs * fit.frequencies[index, axis] + steps / measurements.interval[index, None]).ravel()
+        )
         others, residual = fit_roughly(some, frequencies, fit.active[tried], fit.model)
         # 2. The best one, where it leaves half of the residual.
         sizes = without_nan(median(some.sizes(residual), 1), np.inf)[:, axis].reshape(len(index), -1)
-        place, better = np.arange(len(size)), sizes.min(1) < 0.5 * size[index, axis]
+        place, better = np.arange(len(size)), sizes.min(1) < most_left * size[index, axis]
         best = len(size) + np.arange(len(index)) * len(steps) + sizes.argmin(1)
         place[index[better]] = best[better]
         fit = take_stacks([fit, others], place)
