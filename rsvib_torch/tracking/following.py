@@ -43,6 +43,7 @@ from rsvib_torch.tracking.changing_tones import (
     sudden_change,
     tones_of_rows,
 )
+from rsvib_torch.tracking.tone_filter import ToneFilter
 from rsvib_torch.tracking.tracked_frame import TrackedTones, displacement_std_at_frame, vibration_at_frame
 from rsvib_torch.tracking.tracker import PATIENCE, TrackerState, VibrationTracker
 
@@ -94,7 +95,9 @@ class _Follower(VibrationTracker):
         size_std, frequency_std = _SIZE_STD * np.abs(coefficients), np.full_like(frequencies, _FREQUENCY_STD)
         size_std *= np.minimum(_MAX_SIZE_STD / np.maximum(np.linalg.norm(size_std, axis=1, keepdims=True), 1e-9), 1.0)
         state = replace(state, contradictions=0)
-        return self._begun(state, time, coefficients, frequencies, drift, size_std, frequency_std)
+        exposure_time = self._rows.exposure_time
+        started = ToneFilter.started(time, exposure_time, coefficients, frequencies, drift, size_std, frequency_std)
+        return self._begun(state, started)
 
 
 def _frequencies(tones: Sequence[ChangingTones]) -> Array:
