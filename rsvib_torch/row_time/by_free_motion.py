@@ -8,7 +8,6 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from scipy import linalg
@@ -17,8 +16,7 @@ from rsvib_torch.detection.shapes.free import normal_bands
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.numerics.splines import spline_taps
 from rsvib_torch.numerics.tables import Array
-from rsvib_torch.row_time.joint_fit import FramePlaces
-from rsvib_torch.row_time.row_tones import MAX_CHI_SQUARE, Candidate, RowRecord, RowTimeFit
+from rsvib_torch.row_time.row_tones import MAX_CHI_SQUARE, Candidate, FramePlaces, RowTimeFit
 
 DEGREE = 7  # a simulated motion of 8 Hz bandwidth needs knots of 11 ms to its noise, and of 8 ms with degree 3
 _GRID_FRAMES = 24  # frames whose minima over the grid of row times are refined with all frames
@@ -29,8 +27,8 @@ def row_time_of_splines(
     places: FramePlaces, num_rows: int, low: float, high: float, directions: tuple[float, ...]
 ) -> tuple[RowTimeFit, float] | None:
     """Row time at which the fewest knots explain the displacements, and their distance in s; None if no motion does."""
-    problem = _Problem.of(places, num_rows, high)
-    coarse_problem = _Problem.of(places.of_first_frames(_GRID_FRAMES), num_rows, high)
+    places = places.centred(num_rows)
+    first_places, known = places.of_first_frames(_GRID_FRAMES), float(places.measurements.num_measurements.sum())
     count = max(1, math.ceil(math.log(high / low) / GRID_STEP))
     sizes = [low * (high / low) ** (i / count) for i in range(count + 1)]
     grid = sorted(direction * size for direction in directions for size in sizes)
@@ -39,15 +37,16 @@ def row_time_of_splines(
     while spacing > max(0.7 * blank, 0.1 * period):
         advance, costs = steps(len(grid), "row times"), []
         for tried in grid:
-            costs.append(coarse_problem.evaluate(tried, spacing)[0].chi_square)
+            costs.append(_evaluated(first_places, tried, spacing)[0].chi_square)
             advance()
         minima = [i for i, cost in enumerate(costs) if cost <= min(costs[max(i - 1, 0) : i + 2])]
         lowest = sorted(minima, key=costs.__getitem__)[:6]
-        found = sorted((problem.refined(grid[i], spacing, low, high) for i in lowest), key=lambda one: one.chi_square)
+        found = sorted((_refined(places, grid[i], spacing, low, high) for i in lowest), key=lambda one: one.chi_square)
         # knots twice as close explain noise only
-        closer = problem.refined(found[0].row_time, 0.5 * spacing, low, high)
-        coarse, fine = (problem.parameters(found[0].row_time, step) for step in (spacing, 0.5 * spacing))
-        noise, added = closer.chi_square / max(1.0, problem.known - fine), fine - coarse
+        closer = _refined(places, found[0].row_time, 0.5 * spacing, low, high)
+        # numbers of coefficients of both axes
+        coarse, fine = (2 * _grid(places, found[0].row_time, step)[1][2] for step in (spacing, 0.5 * spacing))
+        noise, added = closer.chi_square / max(1.0, known - fine), fine - coarse
         if found[0].chi_square - closer.chi_square < noise * (added + 3.0 * math.sqrt(2.0 * added)):
             break
         spacing /= 2**0.25
@@ -57,7 +56,7 @@ def row_time_of_splines(
         return None
     # with knots that are a little closer, the errors of the spline are below the noise
     finer = spacing / 2**0.25
-    best = problem.refined(found[0].row_time, finer, low, high)
+    best = _refined(places, found[0].row_time, finer, low, high)
     std = best.std * math.sqrt(noise)
     others = tuple(
         one
@@ -68,69 +67,54 @@ def row_time_of_splines(
     return RowTimeFit(best.row_time, std, others), finer
 
 
-@dataclass(frozen=True, eq=False)
-class _Problem:
-    """Displacements of both axes."""
-
-    records: tuple[RowRecord, RowRecord]  # of x and y
-    period: float  # frame period in s
-    known: float  # number of independent measurements
-
-    @classmethod
-    def of(cls, places: FramePlaces, num_rows: int, row_time: float) -> "_Problem":
-        x, y = (places.of_axis(axis, num_rows, row_time) for axis in range(2))
-        return cls((x, y), places.period, x.num_measurements + y.num_measurements)
-
-    def _grid(self, row_time: float, spacing: float) -> tuple[Array, tuple[float, float, int]]:
-        """Times (N, G) in s of the rows, and first knot, distance and number of knots about ``spacing`` apart."""
-        times = self.records[0].frames * self.period + self.records[0].rows * row_time
-        first, last = float(times.min()), float(times.max())
-        cells = max(1, math.ceil((last - first) / spacing))
-        return times, (first, (last - first) / cells, cells + DEGREE)
-
-    def parameters(self, row_time: float, spacing: float) -> int:
-        """Number of coefficients of both axes."""
-        return 2 * self._grid(row_time, spacing)[1][2]
-
-    def evaluate(self, row_time: float, spacing: float) -> tuple[Candidate, float]:
-        """Splines of both axes at a row time, and the Gauss-Newton step in s, with the coefficients fitted again."""
-        # 1. The coefficients that each row depends on.
-        record = self.records[0]
-        times, grid = self._grid(row_time, spacing)
-        index, basis = spline_taps(times, *grid, degree=DEGREE)
-        _, slope = spline_taps(times, *grid, degree=DEGREE, derivative=1)
-        weights = np.stack([one.weights for one in self.records])
-        bands = normal_bands(index, basis, record.visible, weights, grid[2])
-        cost, step, information = 0.0, 0.0, 0.0
-        for one, weight, band in zip(self.records, weights[..., None], bands, strict=True):
-            # 2. The spline.
-            band[0] += 1e-10 * band[0].mean() + 1e-300
-            factor = linalg.cholesky_banded(band, lower=True, check_finite=False)
-            solution, residual = _fitted(one.values, one, index, basis, factor)
-            # 3. The change of the displacements by the row time that no change of the coefficients cancels.
-            by_row_time = one.relative((slope * solution[index]).sum(-1) * record.rows)
-            _, unexplained = _fitted(by_row_time, one, index, basis, factor)
-            cost += float((weight * np.square(residual)).sum()) * one.independent
-            step += float((weight * unexplained * residual).sum()) * one.independent
-            information += float((weight * np.square(unexplained)).sum()) * one.independent
-        information = max(information, 1e-300)
-        return Candidate(row_time, information**-0.5, cost), step / information
-
-    def refined(self, row_time: float, spacing: float, low: float, high: float) -> Candidate:
-        """Gauss-Newton on the row time from a start in s."""
-        size, sign = abs(row_time), math.copysign(1.0, row_time)
-        for _ in range(8):
-            found, step = self.evaluate(sign * size, spacing)
-            change = min(max(sign * step, -GRID_STEP * size), GRID_STEP * size)
-            size = min(max(size + change, low), high)
-            if abs(change) < 1e-2 * found.std:
-                break
-        return self.evaluate(sign * size, spacing)[0]
+def _grid(places: FramePlaces, row_time: float, spacing: float) -> tuple[Array, tuple[float, float, int]]:
+    """Times (N, G) in s of the rows, and first knot, distance and number of knots about ``spacing`` apart."""
+    times = places.times(row_time)[0]
+    first, last = float(times.min()), float(times.max())
+    cells = max(1, math.ceil((last - first) / spacing))
+    return times, (first, (last - first) / cells, cells + DEGREE)
 
 
-def _fitted(values: Array, record: RowRecord, index: Array, basis: Array, factor: Array) -> tuple[Array, Array]:
-    """Coefficients ``index`` (N, G, M) of ``basis`` functions fitted to values (N, G), and the residual (N, G)."""
-    weighted = record.weights[:, None, None] * values[..., None]
-    right = np.bincount(index.ravel(), (basis * weighted).ravel(), factor.shape[1])
-    solution = linalg.cho_solve_banded((factor, True), right, check_finite=False)
-    return solution, values - record.relative((basis * solution[index]).sum(-1))
+def _evaluated(places: FramePlaces, row_time: float, spacing: float) -> tuple[Candidate, float]:
+    """Splines of both axes at a row time, and the Gauss-Newton step in s, with the coefficients fitted again."""
+    # 1. The coefficients that each row depends on.
+    measured = places.measurements
+    times, grid = _grid(places, row_time, spacing)
+    index, basis = spline_taps(times, *grid, degree=DEGREE)
+    _, slope = spline_taps(times, *grid, degree=DEGREE, derivative=1)
+    weights = measured.inverse_variances[0].T
+    bands = normal_bands(index, basis, measured.visible[0], weights, grid[2])
+
+    def fitted(values: Array, weight: Array, factor: Array) -> tuple[Array, Array]:
+        """Derivatives (N, G) by the time of a spline that is fitted to values (N, G), and the residual."""
+        right = np.bincount(index.ravel(), (basis * (weight * values)[..., None]).ravel(), grid[2])
+        solution = linalg.cho_solve_banded((factor, True), right, check_finite=False)[index]
+        return (slope * solution).sum(-1), values - measured.relative((basis * solution).sum(-1)[None])[0]
+
+    cost, step, information = 0.0, 0.0, 0.0
+    for axis, (weight, band) in enumerate(zip(weights[..., None], bands, strict=True)):
+        # 2. The spline.
+        band[0] += 1e-10 * band[0].mean() + 1e-300
+        factor = linalg.cholesky_banded(band, lower=True, check_finite=False)
+        velocity, residual = fitted(measured.displacements[0, ..., axis], weight, factor)
+        # 3. The change of the displacements by the row time that no change of the coefficients cancels.
+        by_row_time = measured.relative((velocity * places.rows[0])[None])[0]
+        _, unexplained = fitted(by_row_time, weight, factor)
+        cost += float((weight * np.square(residual)).sum())
+        step += float((weight * unexplained * residual).sum())
+        information += float((weight * np.square(unexplained)).sum())
+    independent = float(np.squeeze(measured.independent))
+    information = max(information * independent, 1e-300)
+    return Candidate(row_time, information**-0.5, cost * independent), step * independent / information
+
+
+def _refined(places: FramePlaces, row_time: float, spacing: float, low: float, high: float) -> Candidate:
+    """Gauss-Newton on the row time from a start in s."""
+    size, sign = abs(row_time), math.copysign(1.0, row_time)
+    for _ in range(8):
+        found, step = _evaluated(places, sign * size, spacing)
+        change = min(max(sign * step, -GRID_STEP * size), GRID_STEP * size)
+        size = min(max(size + change, low), high)
+        if abs(change) < 1e-2 * found.std:
+            break
+    return _evaluated(places, sign * size, spacing)[0]

@@ -28,8 +28,7 @@ from rsvib_torch.results.reason import Reason
 from rsvib_torch.row_time import RowTimeCalibration
 from rsvib_torch.row_time.by_free_motion import row_time_of_splines
 from rsvib_torch.row_time.by_tones import CameraClock, bands_of_frames, row_time_of_tones
-from rsvib_torch.row_time.joint_fit import FramePlaces, rows_of_frames
-from rsvib_torch.row_time.row_tones import RowTimeFit
+from rsvib_torch.row_time.row_tones import FramePlaces, RowTimeFit
 
 P = ParamSpec("P")
 
@@ -171,7 +170,7 @@ def _measured_freely(
     measured = rows.measurements.reweighted(residual_of_motion(rows.measurements, motion[0]))
     residual = residual_of_motion(measured, motion[0])
     measured = replace(measured, independent=measured.independent_fraction(residual))
-    return rows_of_frames(measured, clock.period, timing.row_time, clock.num_rows)
+    return FramePlaces.of(measured, clock.period, timing.row_time, clock.num_rows)
 
 
 def _undetermined(reason: Reason) -> RowTimeFit:

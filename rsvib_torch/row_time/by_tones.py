@@ -9,25 +9,27 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from rsvib_torch.detection.measurements import OtherMotion
+from rsvib_torch.detection.measurements import Measurements, OtherMotion
 from rsvib_torch.detection.refinement import refine
 from rsvib_torch.detection.rows.displacements import compared_intervals
 from rsvib_torch.detection.rows.grouped_frames import grouped_frames
 from rsvib_torch.detection.start import band_curve, measurements_of_curve
-from rsvib_torch.detection.tones.fit import MotionModel, ToneFit, motion_of_fit, residual_of, shrunk
+from rsvib_torch.detection.tones.fit import MotionModel, ToneFit, fit_tones, motion_of_fit, residual_of, shrunk
 from rsvib_torch.detection.tones.selection import robust_fit
+from rsvib_torch.detection.tones.uncertainty import linearised
 from rsvib_torch.detection.verdict import residual_reasons, with_remedy
 from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.timing import RowTiming
-from rsvib_torch.numerics.tables import Array, table
+from rsvib_torch.numerics.tables import Array, table, tensor
 from rsvib_torch.options import MAX_TONES, RegistrationOptions
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
-from rsvib_torch.row_time.joint_fit import FramePlaces, fit_row_time, rows_of_frames
 from rsvib_torch.row_time.row_tones import (
     MAX_CHI_SQUARE,
     Candidate,
+    FramePlaces,
+    RowRecord,
     RowTimeFit,
     RowTones,
     candidates,
@@ -35,7 +37,7 @@ from rsvib_torch.row_time.row_tones import (
     fit_row_tones,
 )
 
-MAX_STARTS = 5  # row times that are tried; of 8 random pairs of `benchmark.py --only row_time`, 2 need a second
+MAX_STARTS = 5  # row times that are tried; of 8 random pairs of tones, 2 need a second
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ def row_time_of_tones(
     more, with a hundred times smaller errors.
     """
     highest = 0.5 / options.band_step
-    tones = [find_row_tones(places.of_axis(axis, clock.num_rows, clock.high), highest) for axis in range(2)]
+    tones = [find_row_tones(RowRecord.of(places, axis, clock.num_rows, clock.high), highest) for axis in range(2)]
     if not any(len(one.tones) for one in tones):
         return None
     possible = _possible(tones, clock)
@@ -102,17 +104,20 @@ def row_time_of_tones(
     tried, results = list[float](), list[RowTimeFit]()
     while starts and len(tried) < MAX_STARTS:
         tried.append(starts.pop(0))
-        found = _measured_with(tried[-1], turned(stack, tried[-1]), clock, options, tones)
-        if found is None:
+        measured = _measured_with(tried[-1], turned(stack, tried[-1]), clock, options, tones)
+        if measured is None:
             continue
-        possible = _possible(found.tones, clock, math.copysign(1.0, found.row_time))
+        found, found_tones = measured
+        possible = _possible(found_tones, clock, math.copysign(1.0, found.row_time))
+        best = _as_good_as_the_first(possible)
         mine = min(possible, key=lambda one: abs(one.row_time - found.row_time), default=None)
-        results.append(found.verdict(possible))
-        if mine is not None and all(mine is not one for one in _as_good_as_the_first(possible)):
-            results.pop()
+        if mine is not None and all(mine is not one for one in best):
             if all(abs(possible[0].row_time / one - 1) > 0.01 for one in tried):
                 starts.insert(0, possible[0].row_time)
-        elif not results[-1].findings:
+            continue
+        others = tuple(one for one in best if abs(one.row_time - found.row_time) > 5 * (one.std + found.std))
+        results.append(replace(found, others=others))
+        if not found.findings:
             return results[-1]
     return min(results, key=lambda one: len(one.findings), default=None)
 
@@ -141,44 +146,28 @@ def _tones_at(tones: list[RowTones], row_time: float, period: float) -> tuple[Ar
     return frequencies, active
 
 
-@dataclass(frozen=True, eq=False)
-class _Direct:
-    """Result of the direct measurement near one possible row time."""
-
-    row_time: float
-    std: float
-    fit: ToneFit
-    tones: list[RowTones]
-    places: FramePlaces
-    other_motion: OtherMotion
-    exposure: tuple[float, float] | None
-
-    def verdict(self, possible: list[Candidate]) -> RowTimeFit:
-        """The row time with the reasons against it."""
-        measured, other = self.places.timed(abs(self.row_time)), self.other_motion
-        residual, reasons = residual_of(measured, self.fit), list[Reason]()
-        other = replace(other, unexplained=measured.unexplained(residual), correlated=measured.correlated(residual))
-        quantities = {**vars(other), "permitted": other.permitted}
-        for axis, name in enumerate(AXIS_NAMES[:2]):
-            names = ("unexplained", "correlated", "size", "permitted")
-            numbers = {quantity: float(quantities[quantity][0, axis]) for quantity in names}
-            reasons += with_remedy(residual_reasons(name, numbers), "use frames in which the vibration is steady")
-            count = int(self.fit.active[0, axis].sum())
-            if count >= MAX_TONES:
-                reasons.append(Reason("too_many_tones", name, count, MAX_TONES))
-        others = tuple(
-            one
-            for one in _as_good_as_the_first(possible)
-            if abs(one.row_time - self.row_time) > 5 * (one.std + self.std)
-        )
-        exposure, exposure_std = self.exposure or (None, None)
-        return RowTimeFit(self.row_time, self.std, others, exposure, exposure_std, tuple(reasons))
+def _findings(measured: Measurements, fit: ToneFit, other: OtherMotion) -> tuple[Reason, ...]:
+    """Reasons against the tones of a fit, and with it against its row time."""
+    residual, reasons = residual_of(measured, fit), list[Reason]()
+    other = replace(other, unexplained=measured.unexplained(residual), correlated=measured.correlated(residual))
+    quantities = {**vars(other), "permitted": other.permitted}
+    for axis, name in enumerate(AXIS_NAMES[:2]):
+        names = ("unexplained", "correlated", "size", "permitted")
+        numbers = {quantity: float(quantities[quantity][0, axis]) for quantity in names}
+        reasons += with_remedy(residual_reasons(name, numbers), "use frames in which the vibration is steady")
+        count = int(fit.active[0, axis].sum())
+        if count >= MAX_TONES:
+            reasons.append(Reason("too_many_tones", name, count, MAX_TONES))
+    return tuple(reasons)
 
 
 def _measured_with(
     row_time: float, stack: GreyFrames, clock: CameraClock, options: RegistrationOptions, tones: list[RowTones]
-) -> _Direct | None:
-    """Direct measurement, and the fit of tones and row time, repeated until the row time is the one assumed."""
+) -> tuple[RowTimeFit, list[RowTones]] | None:
+    """Direct measurement, and the fit of tones and row time, repeated until the row time is the one assumed.
+
+    The tones of the rows have independent frequencies per row and per frame. None if too few rows are measured.
+    """
     direction, size = math.copysign(1.0, row_time), abs(row_time)
     frequencies, active = _tones_at(tones, row_time, clock.period)
     timing = clock.timing(size)
@@ -191,9 +180,9 @@ def _measured_with(
         found = refine(rows, intervals, start, None)
         if found.measurements.independent <= 0:  # too few rows agree with each other
             return None
-        places = rows_of_frames(found.measurements, clock.period, size, clock.num_rows)
+        places = FramePlaces.of(found.measurements, clock.period, size, clock.num_rows)
         previous = size
-        size, std, start = fit_row_time(places, size, found.fit)
+        size, std, start = _fit_row_time(places, size, found.fit)
         size = min(max(size, 0.5 * clock.low), clock.period / clock.num_rows)
         if clock.exposure_time is None:
             exposure = _exposure(found.other_motion, timing)
@@ -201,7 +190,34 @@ def _measured_with(
         if abs(size - previous) < 0.3 * std:
             break
     found_tones = [_row_tones(places, start, axis, size, clock) for axis in range(2)]
-    return _Direct(direction * size, std, start, found_tones, places, found.other_motion, exposure)
+    against = _findings(places.timed(size), start, found.other_motion)
+    exposure_time, exposure_std = exposure or (None, None)
+    return RowTimeFit(direction * size, std, (), exposure_time, exposure_std, against), found_tones
+
+
+def _fit_row_time(places: FramePlaces, row_time: float, fit: ToneFit) -> tuple[float, float, ToneFit]:
+    """Row time in s, its standard deviation, and the tones, by Gauss-Newton with all tones fitted in every step."""
+    std, exposure = 0.0, places.measurements.exposure_time
+    for _ in range(12):
+        measured = places.timed(row_time)
+        fit = fit_tones(measured, fit.frequencies, fit.active, fit.model)
+        # derivatives of the displacements by the row time: velocity times row
+        motion, starts = motion_of_fit(fit), tensor(measured.exposure_starts)
+        velocity = (motion.displacement(starts + exposure) - motion.displacement(starts)) / exposure
+        by_row_time = measured.relative(table(velocity) * places.rows[..., None])[..., None]
+        # the part of the change by the row time that no change of the tones cancels
+        information = step = 0.0
+        for axis, problem in linearised(measured, fit):
+            unexplained = problem.unexplained(by_row_time[:, :, :, axis], axis)[0][0, :, 0]
+            information += float(np.square(unexplained).sum())
+            step += float(unexplained @ problem.residual[0])
+        information = max(information, 1e-300)
+        std, step = information**-0.5, step / information
+        row_time = row_time + min(max(step, -0.02 * row_time), 0.02 * row_time)
+        if abs(step) < 1e-2 * std:
+            break
+    measured = places.timed(row_time)
+    return row_time, std, fit_tones(measured, fit.frequencies, fit.active, fit.model)
 
 
 def _row_tones(places: FramePlaces, fit: ToneFit, axis: int, row_time: float, clock: CameraClock) -> RowTones:
@@ -209,7 +225,7 @@ def _row_tones(places: FramePlaces, fit: ToneFit, axis: int, row_time: float, cl
     active = fit.active[0, axis]
     coefficients, frequencies = fit.coefficients[0, axis][active], fit.frequencies[0, axis][active]
     # the record of ``fit`` has another middle than that of the rows
-    record = places.of_axis(axis, clock.num_rows, row_time)
+    record = RowRecord.of(places, axis, clock.num_rows, row_time)
     middle = places.frames[0] * clock.period + places.rows[0] * row_time - record.frames * clock.period
     middle = (middle - record.rows * row_time).mean() + 0.5 * places.measurements.exposure_time
     turned = coefficients * np.exp(2j * math.pi * frequencies * (middle - fit.centre))

@@ -7,12 +7,14 @@ different frequencies have only some row times in common.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from scipy.ndimage import maximum_filter
 from scipy.optimize import least_squares
 
+from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.tones.fit import MIN_GAIN
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.results.reason import Reason
@@ -23,28 +25,76 @@ MIN_SHARE = 0.2  # of the residual sum of squares that a further tone must expla
 
 
 @dataclass(frozen=True, eq=False)
+class FramePlaces:
+    """Frame rows and frames of measurements of one stack, from which their times follow for any row time."""
+
+    measurements: Measurements  # the displacements (B = 1); their times are replaced
+    rows: Array  # (1, N, G) frame rows
+    frames: Array  # (1, N, G) indices of the frames
+    period: float  # frame period in s
+
+    @classmethod
+    def of(cls, measured: Measurements, period: float, row_time: float, num_rows: int) -> Self:
+        """Places of measurements that were timed with a row time in s, of frames of a number of rows."""
+        blank = 0.5 * (period - num_rows * row_time)  # rows up to half of the blanking outside of a frame are its rows
+        frames = np.floor((measured.exposure_starts + blank) / period)
+        return cls(measured, (measured.exposure_starts - frames * period) / row_time, frames, period)
+
+    def times(self, row_time: float) -> Array:
+        """(1, N, G) s, exposure starts with a row time in s."""
+        return self.frames * self.period + self.rows * row_time
+
+    def timed(self, row_time: float) -> Measurements:
+        """The measurements with the times of a row time in s."""
+        return replace(self.measurements, exposure_starts=self.times(row_time))
+
+    def centred(self, num_rows: int) -> "FramePlaces":
+        """Rows and frames that count from the middle row and the middle frame."""
+        middle = 0.5 * (self.frames.min() + self.frames.max())
+        return replace(self, rows=self.rows - 0.5 * (num_rows - 1), frames=self.frames - middle)
+
+    def of_first_frames(self, count: int) -> "FramePlaces":
+        """The rows that were measured in the first frames only."""
+        rows = (self.frames[0] - self.frames.min()).max(-1) < max(count, 1 + np.ptp(self.frames[0, 0]))
+        measured = self.measurements.of_rows(slice(0, int(rows.argmin()) or None))
+        number = measured.visible.shape[1]
+        return FramePlaces(measured, self.rows[:, :number], self.frames[:, :number], self.period)
+
+
+@dataclass(frozen=True, eq=False)
 class RowRecord:
     """Displacements of scene rows along one axis, with the frames and the frame rows that they were measured in."""
 
+    measurements: Measurements  # the displacements (B = 1); their times are not used
+    axis: int
     rows: Array  # (N, G) frame rows, from the middle row
     frames: Array  # (N, G) indices of the frames, from the middle frame
-    values: Array  # (N, G) px, displacements less their mean over the frames that contain the scene row
-    visible: Array  # (N, G) 1 where a frame contains the row, else 0
-    weights: Array  # (N,) px^-2
-    independent: float  # fraction of the measurements that are independent
     row_part: float  # assumed ratio of row time to frame period, for the drift of rows within a frame
+
+    @classmethod
+    def of(cls, places: FramePlaces, axis: int, num_rows: int, row_time: float) -> Self:
+        """The record of frames of a number of rows and an assumed row time in s."""
+        centred = places.centred(num_rows)
+        return cls(places.measurements, axis, centred.rows[0], centred.frames[0], row_time / places.period)
+
+    @property
+    def values(self) -> Array:
+        """(N, G) px, displacements less their mean over the frames that contain the scene row."""
+        return self.measurements.displacements[0, ..., self.axis]
+
+    @property
+    def weights(self) -> Array:
+        """(N,) px^-2."""
+        return self.measurements.inverse_variances[0, :, self.axis]
 
     def relative(self, values: Array) -> Array:
         """Values (N, G, ...) less their mean over the frames that contain the row; 0 in other frames."""
-        seen = self.visible.reshape(*self.visible.shape, *(1,) * (values.ndim - 2))
-        mean = (seen * values).sum(1, keepdims=True) / np.maximum(seen.sum(1, keepdims=True), 1.0)
-        return seen * (values - mean)
+        return self.measurements.relative(values[None])[0]
 
     @property
     def num_measurements(self) -> float:
         """Number of independent differences."""
-        differences = np.maximum(self.visible.sum(1) - 1, 0.0)
-        return float(((self.weights > 0) * differences).sum()) * self.independent
+        return float(self.measurements.num_measurements[0, self.axis])
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +159,8 @@ def _linear(record: RowRecord, values: Array, nu: float, phi: float) -> Array:
 
 def _peaks(record: RowRecord, residual: Array, highest: float, count: int) -> list[tuple[float, float]]:
     """The strongest peaks (nu, phi) of the periodogram of the differences between neighbouring frames."""
-    weight = (record.weights[:, None] * record.visible[:, 1:] * record.visible[:, :-1]).ravel()
+    seen = record.measurements.visible[0]
+    weight = (record.weights[:, None] * seen[:, 1:] * seen[:, :-1]).ravel()
     difference = np.diff(residual, axis=1).ravel()
     difference = difference - (weight * difference).sum() / max(weight.sum(), 1e-300)
     rows, frames = record.rows[:, :-1].ravel(), record.frames[:, :-1].ravel()

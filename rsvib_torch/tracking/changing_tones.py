@@ -18,7 +18,7 @@ from torch import Tensor
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
 from rsvib_torch.detection.start import measurements_of_curve
-from rsvib_torch.detection.tones.fit import MIN_GAIN
+from rsvib_torch.detection.tones.fit import MIN_GAIN, offset_gain
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.numerics.tables import Array, table, true_runs, valid_mean
 from rsvib_torch.options import MAX_TONES, RegistrationOptions
@@ -63,7 +63,7 @@ class ChangingTones:
 
         Tones that are much larger than these are drifts, and much smaller ones errors of the measurement.
         """
-        step = 2 / (_STEPS * (self.knots[1] - self.knots[0]))
+        step = 2 * _step(self.knots)
         largest = np.abs(self.coefficients).mean(1).max(initial=0.0)
         for frequency, size in zip(
             found.frequencies.tolist(), np.abs(found.coefficients).mean(1).tolist(), strict=True
@@ -211,10 +211,14 @@ class _Record:
         knots = np.linspace(starts[0], end, 2 + round(len(starts) / _KNOT_FRAMES))
         averaged = (rows.exposure_time, band_rows * rows.row_time)
         # below two periods between knots, a tone is not distinguished from a drift
-        tried = np.arange(2 * _STEPS, 0.5 * _STEPS * (knots[1] - knots[0]) / averaged[1]) / (
-            _STEPS * (knots[1] - knots[0])
-        )
+        step = _step(knots)
+        tried = step * np.arange(2 * _STEPS, 0.5 / (step * averaged[1]))
         return cls(knots, np.diff(starts), tried, averaged)
+
+
+def _step(knots: Array) -> float:
+    """Hz, distance of the frequencies that are tried."""
+    return float(1 / (_STEPS * (knots[1] - knots[0])))
 
 
 def _hats(times: Array, knots: Array) -> Array:
@@ -254,14 +258,13 @@ class _AxisOffsets:
 
     def is_blind(self, frequencies: Array) -> Array:
         """Whether all frames are displaced alike by a tone."""
-        gain = np.abs(2 * np.sin(math.pi * np.multiply.outer(self.record.intervals, frequencies)))
-        return np.asarray(gain.max(0) < MIN_GAIN)
+        return np.asarray(offset_gain(frequencies, self.record.intervals) < MIN_GAIN)
 
     def found(self) -> tuple[list[float], float | None]:
         """Frequencies of the tones, strongest first, and that of another tone that explains as much as one of them."""
         found: list[float] = []
         other, count = None, (self.weights > 0).sum()
-        step = 1 / (_STEPS * (self.record.knots[1] - self.record.knots[0]))
+        step = _step(self.record.knots)
         left = self.record.tried[~self.is_blind(self.record.tried)]
         while len(found) < MAX_TONES and len(left):
             # 1. The tone that explains most beside those before, with its frequency to a tenth of a step.
@@ -318,7 +321,7 @@ class _AxisOffsets:
                 turn = np.angle((coefficients[:, 1:] * coefficients[:, :-1].conj()).sum(1))
                 frequencies = frequencies + turn / (2 * math.pi * spacing)
                 # two that become equal would cancel each other, with amplitudes of 1e6 px
-                apart = np.abs(np.subtract.outer(frequencies, frequencies)) > 1 / (_STEPS * spacing)
+                apart = np.abs(np.subtract.outer(frequencies, frequencies)) > _step(self.record.knots)
                 frequencies = frequencies[(apart | ~np.tri(len(frequencies), k=-1, dtype=bool)).all(1)]
         kept = np.prod([np.sinc(frequencies * seconds) for seconds in self.record.averaged], 0)
         coefficients = coefficients / np.maximum(kept, 0.1)[:, None]

@@ -8,12 +8,11 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 from torch.nn import functional
 
@@ -43,6 +42,7 @@ from rsvib_torch.tracking.changing_tones import (
     sudden_change,
     tones_of_rows,
 )
+from rsvib_torch.tracking.tone_filter import ToneFilter
 from rsvib_torch.tracking.tracked_frame import TrackedTones, displacement_std_at_frame, vibration_at_frame
 from rsvib_torch.tracking.tracker import PATIENCE, TrackerState, VibrationTracker
 
@@ -87,27 +87,23 @@ class _Follower(VibrationTracker):
         before, last = state.frames[-2:]
         time = 0.5 * (before.time + last.time) + 0.5 * last.images.shape[-2] * self._rows.row_time
         parts = [of_axis.at(time) for of_axis in self._known]
-        frequencies = _frequencies(self._known)
-        count = frequencies.shape[-1]
+        count = max(1, *(len(size) for size, _ in parts))
         coefficients = np.array([np.pad(size, (0, count - len(size))) for size, _ in parts])
+        frequencies = np.array([np.pad(one.frequencies, (0, count - len(one.frequencies))) for one in self._known])
         drift = np.array([[velocity, 0.0] for _, velocity in parts])
         size_std, frequency_std = _SIZE_STD * np.abs(coefficients), np.full_like(frequencies, _FREQUENCY_STD)
         size_std *= np.minimum(_MAX_SIZE_STD / np.maximum(np.linalg.norm(size_std, axis=1, keepdims=True), 1e-9), 1.0)
         state = replace(state, contradictions=0)
-        return self._begun(state, time, coefficients, frequencies, drift, size_std, frequency_std)
-
-
-def _frequencies(tones: Sequence[ChangingTones]) -> Array:
-    """(2, K) Hz of the tones of both axes, 0 for those that an axis does not have."""
-    count = max(1, *(len(one.frequencies) for one in tones))
-    return np.array([np.pad(one.frequencies, (0, count - len(one.frequencies))) for one in tones])
+        exposure_time = self._rows.exposure_time
+        started = ToneFilter.started(time, exposure_time, coefficients, frequencies, drift, size_std, frequency_std)
+        return self._begun(state, started)
 
 
 @dataclass(frozen=True, eq=False)
 class _AtFrame:
     """Both axes at a frame, in row order; the time origin is the start of the frame.
 
-    Tones are in the order of those of the record.
+    Tones are in the order of those of the record, with which the filters begin.
     """
 
     values: Mapping[str, Tensor]  # (2, K), the fields of ``Vibration``
@@ -167,6 +163,7 @@ def _followed(stack: GreyFrames, options: FollowOptions) -> FollowedVibration:
         raise ValueError(str(against[0]))
     starts = table(rows.frame_starts(stack.images.shape[1]))
     images = stack.images[0] if stack.valid is None else stack.images[0].masked_fill(~stack.valid[0], math.nan)
+    rows = replace(rows, frame_start_times=None)  # from here on, the starts have them
     parts, at_rest = moving_parts(curve)
     judged = [_unknown("no_tone" if rests else "not_followed") for rests in at_rest]
     for part in parts:
@@ -185,10 +182,8 @@ def _followed_part(
     """Each axis at each of T frames (T, H, W) with their starts in s, and the offsets of their row bands."""
     number, height = images.shape[:2]
     tones: Sequence[ChangingTones] = changing_tones(curve, starts, rows, _BANDS)
-    sensor = rows
-    rows = replace(rows, frame_start_times=None)
     ends = starts + (height - 1) * rows.row_time + rows.exposure_time
-    best: tuple[int, list[list[_Judged]]] = (-1, [])
+    results: list[list[list[_Judged]]] = []
     for last in (False, True):
         # 1. Both trackers. Backwards, a frame begins with the end of its last row.
         step = steps(2 * number, "frames")
@@ -204,36 +199,34 @@ def _followed_part(
             for known, one, frequency in zip(tones, found, missing, strict=True)
         ]
         # 3. What both trackers agree on, at each frame and axis.
-        of_record = _frequencies(tones)
-        both_trackers: Iterable[list[_AtFrame | None]] = (
-            [
-                None if one is None else _at_frame(one, of_record, start, origin, rows, height, sign)
-                for one, start, origin in zip(tracked, starts, origins, strict=True)
-            ]
-            for tracked, origins, sign in ((forwards, starts, 1), (backwards, ends, -1))
+        both_trackers = (
+            _at_frames(forwards, starts, starts, rows, height, 1),
+            _at_frames(backwards, starts, ends, rows, height, -1),
         )
         judged = [
             [_judged([one for one in both if one is not None], axis, others[axis]) for axis in range(2)]
-            for both in zip(*map(_with_stds_of_neighbours, both_trackers), strict=True)
+            for both in zip(*both_trackers, strict=True)
         ]
-        judged = _with_reasons_of_axes(_with_wider_ends(judged))
-        reliable = sum(not against for of_frame in judged for _, against in of_frame)
-        if reliable > best[0]:
-            best = (reliable, judged)
+        results.append(_with_reasons_of_axes(_with_wider_ends(judged)))
         # 4. Once more, with the tones that are missing.
         if last or missing == [None, None]:
             break
         tones = [known if one is None else other for known, other, one in zip(tones, found, missing, strict=True)]
     # 5. Where few frames are known, the vibration may change suddenly: the frames before and behind it on their own.
-    changed = sudden_change(curve, starts, sensor, _BANDS) if best[0] < number else None
+    few_known = max(map(_num_reliable, results)) < number
+    changed = sudden_change(curve, starts, rows, _BANDS) if few_known else None
     if changed is not None:
         divided = [_unknown("not_followed") for _ in range(number)]
         for part in (slice(0, changed), slice(changed + 1, number)):
             if part.stop - part.start >= _MIN_FRAMES:
-                divided[part] = _followed_part(images[part], starts[part], of_frames(curve, part), sensor, options)
-        if sum(not against for of_frame in divided for _, against in of_frame) > best[0]:
-            return divided
-    return best[1]
+                divided[part] = _followed_part(images[part], starts[part], of_frames(curve, part), rows, options)
+        results.append(divided)
+    return max(results, key=_num_reliable)
+
+
+def _num_reliable(judged: list[list[_Judged]]) -> int:
+    """Number of axes of frames without a reason against them."""
+    return sum(not against for of_frame in judged for _, against in of_frame)
 
 
 def _reversed(tones: Sequence[ChangingTones]) -> list[ChangingTones]:
@@ -266,12 +259,34 @@ def _tracked(
     return found
 
 
-def _at_frame(
-    tones: TrackedTones, frequencies: Array, start: float, origin: float, rows: RowTiming, height: int, direction: int
-) -> _AtFrame:
-    """Both axes at a frame that starts at ``start`` in s, from tones with the time origin ``origin``.
+def _at_frames(
+    tracked: Sequence[TrackedTones | None],
+    starts: Array,
+    origins: Array,
+    rows: RowTiming,
+    height: int,
+    direction: int,
+) -> list[_AtFrame | None]:
+    """Both axes at frames that start at ``starts`` in s, from the tones of one tracker with time origins in s.
 
-    Each tone has the place of the nearest one of ``frequencies`` (2, K) in Hz.
+    Each has the mean standard deviations of the five frames around it. They change with the process noise that is the
+    most probable at a frame, by up to ten times, the errors do not.
+    """
+    found = [
+        None if tones is None else _at_frame(tones, start - origin, rows, height, direction)
+        for tones, start, origin in zip(tracked, starts, origins, strict=True)
+    ]
+    averaged: list[_AtFrame | None] = []
+    for index, one in enumerate(found):
+        around = [other.std for other in found[max(index - 2, 0) : index + 3] if one and other]
+        stds = {name: torch.stack([std[name] for std in around]).mean(0) for name in _STDS if around}
+        averaged.append(one and replace(one, std=stds))
+    return averaged
+
+
+def _at_frame(tones: TrackedTones, start: float, rows: RowTiming, height: int, direction: int) -> _AtFrame:
+    """Both axes at a frame that starts ``start`` s behind the time origin of the tones.
+
     ``direction`` is -1 for tones backwards in time: sin(-2 pi f t + phi) = sin(2 pi f t + pi - phi).
     """
     vibrations, stds_of_fit = vibration_at_frame(tones.fit, rows, height)
@@ -284,36 +299,19 @@ def _at_frame(
             image_motion=-signs * vibration.image_motion,
             image_acceleration=signs * vibration.image_acceleration,
         )
-    vibration = vibration.timed_from(start - origin)
+    vibration = vibration.timed_from(start)
     exposures = table(rows.row_starts(1, height)[0, ::8])
     known = displacement_std_at_frame(tones.fit, tones.growth, rows, height)
     residual = np.nanmean(np.abs(residual_of(tones.measurements, tones.fit)[0]), (0, 1))
     without_drift = Vibration(vibration.amplitude, vibration.frequency, vibration.phase)
     moved = table(without_drift.mean_displacement(tensor(exposures), rows.exposure_time))
-    order = [
-        linear_sum_assignment(np.abs(np.subtract.outer(expected, found)))[1]
-        for expected, found in zip(frequencies, table(vibration.frequency), strict=True)
-    ]
-    places = torch.from_numpy(np.array(order))
+    places = tensor((-tones.fit.amplitude[0]).argsort(-1, kind="stable").argsort(-1))  # of the tones of the fit
     values, stds = (
         {name: getattr(of, name).gather(-1, places) for name in of_tones} | {name: getattr(of, name) for name in _DRIFT}
         for of, of_tones in ((vibration, _TONE), (std, (*_TONE, "period")))
     )
     stds["displacement"] = tensor(known)
     return _AtFrame(values, stds, known, residual, tones.findings, moved - moved.mean(0))
-
-
-def _with_stds_of_neighbours(found: Sequence[_AtFrame | None]) -> list[_AtFrame | None]:
-    """The frames of one tracker with the mean standard deviations of the five frames around each.
-
-    They change with the process noise that is the most probable at a frame, by up to ten times, the errors do not.
-    """
-    averaged: list[_AtFrame | None] = []
-    for index, one in enumerate(found):
-        around = [other.std for other in found[max(index - 2, 0) : index + 3] if one and other]
-        stds = {name: torch.stack([std[name] for std in around]).mean(0) for name in _STDS if around}
-        averaged.append(one and replace(one, std=stds))
-    return averaged
 
 
 def _mean(both: Sequence[_AtFrame], axis: int) -> _AtFrame:
@@ -408,16 +406,14 @@ def _assembled(judged: Sequence[Sequence[_Judged]], starts: Array, stack: GreyFr
     def of_axes(name: str, *, std: bool = False) -> Tensor:
         """(T, 2, K) values of tones, padded with zeros, or (T, 2) others, or their standard deviations."""
         shape = (count,) if name in (*_TONE, "period") else ()
-        unknown = math.inf if std else 0.0
-        values = torch.full((len(found), 2, *shape), unknown, dtype=torch.float64, device="cpu")
+        values = torch.full((len(found), 2, *shape), math.inf if std else 0.0, dtype=torch.float64, device="cpu")
         for index, axis, one in known:
             given = (one.std if std else one.values)[name][axis]
             values[index, axis] = functional.pad(given, (0, count - len(given))) if shape else given
         return values
 
-    amplitude = of_axes("amplitude")
+    amplitude, frequency, phase = (of_axes(name) for name in _TONE)
     order = torch.argsort(-amplitude, dim=-1, stable=True)  # that of the tones of a Vibration
-    amplitude, frequency, phase = (of_axes(name).gather(-1, order) for name in _TONE)
     speed, acceleration = (of_axes(name) for name in _DRIFT)
     origins = tensor(starts)  # of the frames; that of the stack is 0
     vibration = Vibration(amplitude, frequency, phase, speed, acceleration).timed_from(-origins).from_row_order(timing)

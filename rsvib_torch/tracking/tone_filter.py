@@ -27,6 +27,9 @@ from rsvib_torch.numerics.tables import Array, median, split_axis, without_nan
 # A camera held by hand shakes by 2 px at 3 Hz, which are 13000 px/s^3. Measured in docs/live.md.
 PROCESS_NOISE = ((0.00003, 200.0), (0.00003, 4000.0), (0.5, 200.0), (12.0, 1200.0))
 _STAY = 0.95  # probability that the process noise of the next frame is the same
+# Standard deviations at the start, px/s and px/s^2 (tones and drift are correlated, their sum is more accurate), and
+# 1/s: amplitudes that double within a second or two are followed
+_DRIFT_STD, _GROWTH_STD = (10.0, 500.0), 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,17 +44,26 @@ class ToneFilter:
 
     @classmethod
     def started(
-        cls, time: float, coefficients: Array, frequencies: Array, drift: Array, std: Array, exposure_time: float
+        cls,
+        time: float,
+        exposure_time: float,
+        coefficients: Array,
+        frequencies: Array,
+        drift: Array,
+        size_std: Array,
+        frequency_std: Array,
     ) -> Self:
-        """Filter from tones at a time, in s.
+        """Filter from tones at a time, in s, as is the exposure time.
 
         Coefficients (A, K) complex128 px are 0 for tones that do not exist; frequencies (A, K) are in Hz, the drift (A,
-        2) in px/s and px/s^2. The standard deviations (A, 4 K + 2) of the parameters are 0 for those that are fixed.
+        2) in px/s and px/s^2, and the standard deviations (A, K) of coefficients and frequencies in px and Hz.
         """
-        models = len(PROCESS_NOISE)
-        probability = np.full((len(std), models), (1 - _STAY) / (models - 1))
+        models, rates = len(PROCESS_NOISE), 2j * math.pi * frequencies
+        probability = np.full((len(drift), models), (1 - _STAY) / (models - 1))
         probability[:, 0] = _STAY
-        rates = np.zeros_like(frequencies) + 1j * 2 * math.pi * frequencies
+        parts = np.stack([size_std, size_std, np.full_like(size_std, _GROWTH_STD), 2 * math.pi * frequency_std], -1)
+        of_tones = np.where((np.abs(coefficients) > 0)[..., None], parts, 0.0).reshape(len(drift), -1)
+        std = np.concatenate([of_tones, np.broadcast_to(_DRIFT_STD, drift.shape)], -1)
         values = np.repeat(_packed(coefficients, rates, drift)[:, None], models, 1)
         covariance = np.repeat((np.square(std)[..., None] * np.eye(std.shape[-1]))[:, None], models, 1)
         return cls(time, values, covariance, probability, exposure_time)
@@ -226,20 +238,23 @@ class ToneFilter:
         drift = (self.probability[..., None] * self.drift).sum(1)
         return step * drift[:, 0] + 0.5 * step**2 * drift[:, 1]
 
+    @property
+    def _best_covariance(self) -> Array:
+        """(A, P, P) covariance of the parameters, of the most probable filter."""
+        best = self.probability.argmax(-1)[:, None, None, None]
+        return np.take_along_axis(self.covariance, best, 1)[:, 0]
+
     def path_std(self, step: float) -> float:
         """px, standard deviation of ``path`` by the most probable filter; of the worse axis."""
-        best = self.probability.argmax(-1)
-        covariance = np.take_along_axis(self.covariance[..., -2:, -2:], best[:, None, None, None], 1)[:, 0]
-        jerk = np.array(PROCESS_NOISE)[best, 1]
+        jerk = np.array(PROCESS_NOISE)[self.probability.argmax(-1), 1]
         powers = np.array([step, 0.5 * step**2])
-        variance = (covariance @ powers) @ powers + np.square(jerk) * (abs(step) ** 5 / 20)
+        variance = (self._best_covariance[:, -2:, -2:] @ powers) @ powers + np.square(jerk) * (abs(step) ** 5 / 20)
         return float(np.sqrt(np.maximum(variance, 0.0).max()))
 
     def displacement_std(self) -> float:
         """px, standard deviation of the tones at the reference time, by the most probable filter; of the worse axis."""
-        best = self.probability.argmax(-1)[:, None, None]
-        variance = np.take_along_axis(self.covariance.diagonal(axis1=-2, axis2=-1), best, 1)[:, 0, :-2]
-        real, imaginary = variance[:, ::4], variance[:, 1::4]
+        variance = self._best_covariance.diagonal(axis1=-2, axis2=-1)
+        real, imaginary = variance[:, :-2:4], variance[:, 1:-2:4]
         return float(np.sqrt(np.maximum((0.5 * (real + imaginary)).sum(-1), 0.0).max()))
 
     def growth(self) -> Array:

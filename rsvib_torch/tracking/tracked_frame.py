@@ -79,9 +79,7 @@ class TrackedFrame:
             from the first row of this frame. None if they were not measured.
         frame: The frame as given.
         tones: The tones at this frame; None if they are not known.
-        window: Number of frames of a detection, for the sensitivity to the timing.
-        method: Method of ``restore``.
-        options: Options of the method.
+        options: Options of the tracker.
         lost: Why the motion that was followed until the frame before is not known any more; empty if it is.
         latency: Number of frames that were given after this one.
     """

@@ -73,8 +73,6 @@ _MAX_CHANGE = 0.2  # px, by which a round may change the displacement of a row; 
 _MAX_ROUNDS = 3  # measurements of one frame
 _MAX_PATH = 4.0  # px; the scene may move so far before its gradients are computed again
 _MAX_AGE = 30  # frames; then gradients are computed again, because the scene may have changed
-_DRIFT_STD = (10.0, 500.0)  # px/s and px/s^2, at the start; tones and drift are correlated, their sum is more accurate
-_GROWTH_STD = 0.5  # 1/s, at the start; amplitudes that double within a second or two are followed
 # Methods and numbers of tones of a detection, in this order. Bands are a sufficient start, because the filter measures
 # the rows. The direct method takes up to ten times as long (9 s for eight frames of a flying drone without a tone).
 _STARTS: tuple[tuple[DetectionMethod, int | None], ...] = (("bands", None), ("direct", 1))
@@ -473,29 +471,11 @@ class VibrationTracker:
         # 2. Tones, with twice the standard deviations, because the last frame is measured again. Those of a record
         # allow for further tones, which the filter does not.
         size_std = torch.minimum(std.amplitude, 0.05 * vibration.amplitude)
-        return self._begun(
-            state, middle, *tables(tones * ~slow, vibration.frequency, drift, 2.0 * size_std, 2.0 * std.frequency)
-        )
+        parts = tables(tones * ~slow, vibration.frequency, drift, 2.0 * size_std, 2.0 * std.frequency)
+        return self._begun(state, ToneFilter.started(middle, self._rows.exposure_time, *parts))
 
-    def _begun(
-        self,
-        state: TrackerState,
-        time: float,
-        coefficients: Array,
-        frequency: Array,
-        drift: Array,
-        size_std: Array,
-        frequency_std: Array,
-    ) -> TrackerState:
-        """Start the filter with tones (2, K) at a time, and compare the last frame with the one before.
-
-        Coefficients are those of ``ToneFilter``; standard deviations (2, K) are in px and Hz.
-        """
-        growth_std = np.full_like(size_std, 2.0 * _GROWTH_STD)
-        parts = np.stack([size_std, size_std, growth_std, 2 * math.pi * frequency_std], -1)
-        tone_std = np.where((np.abs(coefficients) > 0)[..., None], parts, 0.0).reshape(2, -1)
-        all_std = np.concatenate([tone_std, np.broadcast_to(_DRIFT_STD, (2, 2))], -1)
-        started = ToneFilter.started(time, coefficients, frequency, drift, all_std, self._rows.exposure_time)
+    def _begun(self, state: TrackerState, started: ToneFilter) -> TrackerState:
+        """Follow tones with a filter that starts between the last two frames, and compare these."""
         before, last = state.frames[-2:]
         columns = (
             slice(None) if self.options.columns is None else detailed_parts(last.images[:1], self.options.columns)[0]

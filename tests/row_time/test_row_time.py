@@ -14,7 +14,7 @@ from rsvib_torch.config import read_config
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.row_time.by_free_motion import row_time_of_splines
-from rsvib_torch.row_time.joint_fit import FramePlaces
+from rsvib_torch.row_time.row_tones import FramePlaces
 
 HEIGHT, WIDTH, FRAMES = 192, 144, 5
 ROW_TIME, FRAME_ROWS = 6e-5, 240

@@ -203,7 +203,8 @@ def _detect(stack: GreyFrames, timing: SensorTiming, options: FreeMotionOptions,
         by_row_time = displacements_by_row_time(measured, motion[0], rowwise, len(starts))
         changed = replace(weighed, displacements=weighed.displacements + by_row_time)
         other = _fit_spline(changed, motion.spacing, record, table(times).ravel())
-        fit = replace(fit, by_row_time=other.coefficients - fit.coefficients)
+        changes = other.coefficients - fit.coefficients
+        fit = replace(fit, covariances=[of + np.outer(c, c) for of, c in zip(fit.covariances, changes, strict=True)])
     motion = _motion(fit, (0.25 * scale.width, 0.25 * scale.height))  # px; beyond, frames share too little
     # 3. The row bands, which may contradict the motion of the middle column.
     of_middle: Motion = motion
@@ -367,7 +368,6 @@ class _SplineFit:
     start: float  # time of the first knot in seconds
     spacing: float  # seconds between knots
     covariances: list[Array]  # (N, N) float64 px^2 of the coefficients of each axis; none while iterating
-    by_row_time: Array | None = None  # (A, N) px, change by the standard deviation of the row time
 
     @property
     def knots(self) -> Array:
@@ -378,9 +378,6 @@ class _SplineFit:
         """Variances (S, F, A) of sums of ``weights`` (S, F, M) times coefficients ``index`` (S, M)."""
         parts = [covariance[index[:, :, None], index[:, None]] for covariance in self.covariances]
         variances = [((weights @ of_axis) * weights).sum(-1) for of_axis in parts]
-        if self.by_row_time is not None:
-            changes = [(weights * of_axis[index][:, None]).sum(-1) for of_axis in self.by_row_time]
-            variances = [of_axis + np.square(change) for of_axis, change in zip(variances, changes, strict=True)]
         return np.maximum(np.stack(variances, -1), 0.0)
 
 
