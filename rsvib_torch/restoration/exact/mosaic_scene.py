@@ -13,13 +13,12 @@ from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.mosaic import interpolated_colours, measures
 from rsvib_torch.numerics.fourier import extend_rows
 from rsvib_torch.options import ExactOptions
-from rsvib_torch.restoration.exact.exact import MIN_LEVEL, scene_period
-from rsvib_torch.restoration.exact.filling import measured_values
+from rsvib_torch.restoration.exact.filling import measured_values, scene_period
 from rsvib_torch.restoration.exact.finer_scene import phase_spread
 from rsvib_torch.restoration.exact.priors import check_prior
-from rsvib_torch.restoration.exact.scene_solver import Partition, SceneSolver
+from rsvib_torch.restoration.exact.scene_solver import MIN_LEVEL, Partition, SceneSolver
 from rsvib_torch.restoration.exact.similar_patches import similar_patches
-from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
+from rsvib_torch.restoration.frame_motion import FrameMotion, MovingFrames, joint_groups
 from rsvib_torch.restoration.noise import noise_levels
 from rsvib_torch.restoration.restoration_warning import warn_of_restoration
 from rsvib_torch.restoration.scene_model.finer_grid import SCALE, FinerObservation, fit_polynomial_prior
@@ -122,15 +121,7 @@ class MosaicSolver:
         return _colours(self._observation.image(coefficients[:, :, None]))[0]
 
 
-def restore_mosaic(
-    frames: Tensor,
-    motion: FrameMotion,
-    options: ExactOptions,
-    *,
-    colours: Tensor,
-    ignore: Tensor | None = None,
-    clipped: Tensor | None = None,
-) -> Tensor:
+def restore_mosaic(given: MovingFrames, colours: Tensor, options: ExactOptions) -> Tensor:
     """Colour images (B, groups, 3, scale H, scale W) from mosaics: all frames of a group and all colours together.
 
     The scene is unknown on a grid of half pixels, and each pixel measures one of its colours. Luminance and two colour
@@ -138,11 +129,11 @@ def restore_mosaic(
     predicted from the restored scene. ``similar_patches`` removes noise from it, and interpolates the colours of each
     frame where the frames do not determine them, as with one frame.
 
-    Arguments as above ``METHODS``; ``colours`` (B, T, 1, H, W) is the colour that each pixel measures, 0 to 2.
-    ``noise="auto"`` is estimated from the residual of the frames of a group; that of one frame is too low rather than
-    too high.
+    ``colours`` are those of the frames. ``noise="auto"`` is estimated from the residual of the frames of a group; that
+    of one frame is too low rather than too high.
     """
     # 1. Check the options, and list the frames of each result.
+    frames, motion, ignore, clipped = given.images, given.motion, given.ignore, given.clipped
     height, width = frames.shape[-2:]
     factor, scale = options.regularisation, options.scale
     check_prior(options.prior, scale=scale, mosaic=True)

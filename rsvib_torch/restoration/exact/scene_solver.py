@@ -30,6 +30,8 @@ from rsvib_torch.numerics.banded_solver import (
 )
 from rsvib_torch.restoration.scene_model.observation import Observation
 
+MIN_LEVEL = 1e-5  # of full scale, lowest noise level assumed; below, the systems lose digits in single precision
+
 
 def row_windows(rows: int, count: int, overlap: int = 96) -> list[slice]:
     """Windows of one size that cover all rows, neighbours overlapping by at least twice ``overlap`` rows.
