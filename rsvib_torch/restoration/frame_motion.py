@@ -9,9 +9,9 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -162,9 +162,10 @@ class MovingFrames:
         """Prepared frames with their motion."""
         return cls(frames.filled, motion, frames.missing, frames.saturated, frames.colours)
 
-    def mapped(self, change: Callable[[Tensor], Tensor], **stated: Any) -> "MovingFrames":
+    def mapped(self, change: Callable[[Tensor], Tensor], **stated: Any) -> Self:
         """The frames with a change of images and masks, and other values of further fields."""
-        changed: Table = {name: change(values) for name, values in vars(self).items() if isinstance(values, Tensor)}
+        tensors = ((field.name, getattr(self, field.name)) for field in fields(self))
+        changed: Table = {name: change(values) for name, values in tensors if isinstance(values, Tensor)}
         return replace(self, **changed, **stated)
 
 
