@@ -4,9 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from rsvib_torch.options import ExactOptions
 from rsvib_torch.restoration.exact.exact import model_frames, solve_scenes
-from rsvib_torch.restoration.exact.priors import PRIORS
-from rsvib_torch.restoration.exact.scene_solver import Partition
 from rsvib_torch.restoration.frame_motion import MovingFrames, frame_motion, joint_groups
 
 
@@ -21,5 +20,5 @@ def solved(model, *, joint=False, regularisation=1.0, **changes):
     model = replace(model, **changes)
     scenes = model.scenes(joint_groups(model.images.shape[1], joint))
     scenes = replace(scenes, strength=np.full(len(scenes.stack), regularisation))
-    images, _ = solve_scenes(model, scenes, PRIORS["gaussian"], regularisation, Partition())
+    images, _ = solve_scenes(model, scenes, ExactOptions(regularisation=regularisation))
     return images[:, 0]

@@ -31,8 +31,8 @@ from rsvib_torch.restoration.exact.filling import (
 )
 from rsvib_torch.restoration.exact.finer_scene import FrameDifference, finer_scene, warn_of_frames
 from rsvib_torch.restoration.exact.mosaic_scene import restore_mosaic
-from rsvib_torch.restoration.exact.priors import PRIORS, Prior, check_prior
-from rsvib_torch.restoration.exact.scene_solver import MIN_LEVEL, Partition, SceneProblem
+from rsvib_torch.restoration.exact.priors import PRIORS, check_prior
+from rsvib_torch.restoration.exact.scene_solver import MIN_LEVEL, MOST_THREADS, Partition, SceneProblem
 from rsvib_torch.restoration.frame_motion import MovingFrames, joint_groups
 from rsvib_torch.restoration.noise import noise_levels
 from rsvib_torch.restoration.scene_model.cross_validation import prior_strengths
@@ -59,23 +59,21 @@ def restore_exact(frames: MovingFrames, options: ExactOptions) -> Tensor:
     # 1. Check the options, and list the frames of each result.
     if frames.colours is not None:
         return restore_mosaic(frames, frames.colours, options)
-    factor, scale, prior = options.regularisation, options.scale, options.prior
-    check_prior(prior, scale=scale)
+    check_prior(options.prior, scale=options.scale)
     groups = joint_groups(frames.images.shape[1], options.joint)
-    partition = Partition(options.chunk_frequencies, options.segments)
 
     # 2. Estimate what all scenes of a stack have in common: noise levels and prior.
-    model = model_frames(frames, noise=options.noise, scale=scale)
+    model = model_frames(frames, noise=options.noise, scale=options.scale)
 
     # 3. Build the scenes of all stacks, and select the strength of the prior of each by cross-validation.
     scenes = model.scenes(groups)
-    scenes = replace(scenes, strength=factor * model.strengths(scenes))
+    scenes = replace(scenes, strength=options.regularisation * model.strengths(scenes))
 
     # 4. Fill missing values, and solve the banded systems of all frequencies.
-    images, differences = solve_scenes(model, scenes, PRIORS[prior], factor, partition)
+    images, differences = solve_scenes(model, scenes, options)
 
     # 5. On the finer grid, frames that contradict their scene show that the motion is wrong.
-    if scale != 1:
+    if options.scale != 1:
         warn_of_frames(differences, model.places(scenes))
     return images.unflatten(0, (len(frames.images), -1))
 
@@ -281,11 +279,9 @@ def model_frames(given: MovingFrames, *, noise: float | Literal["auto"] = "auto"
     )
 
 
-def solve_scenes(
-    model: FrameModel, scenes: Scenes, prior: Prior, regularisation: float, partition: Partition
-) -> tuple[Tensor, list[FrameDifference]]:
+def solve_scenes(model: FrameModel, scenes: Scenes, options: ExactOptions) -> tuple[Tensor, list[FrameDifference]]:
     """Images (N, C, S H, S W) of scenes, and, on the finer grid, the differences of the frames of each scene."""
-    frames, width = model.images, model.images.shape[-1]
+    width, partition = model.images.shape[-1], Partition(options.chunk_frequencies, options.segments)
     blocks = _blocks(model, scenes)
     found: dict[int, Tensor] = {}
     differences: list[FrameDifference] = []
@@ -297,24 +293,18 @@ def solve_scenes(
         some = take_stacks([scenes], np.array(numbers))
         problem = model.problem(some, kind, partition)
         if model.scale == 1:
-            deviations = prior.function(problem, regularisation)
+            deviations = PRIORS[options.prior].function(problem, options.regularisation)
         else:
             deviations, difference = finer_scene(problem, width, model.motion.neglected)
             differences.append(difference)
         found.update(zip(numbers, deviations[..., : model.scale * width] + model.mean[some.stack], strict=True))
         advance(len(numbers))
 
-    if torch.is_grad_enabled() and (frames.requires_grad or model.motion.exposures[0].requires_grad):
+    if torch.is_grad_enabled() and (model.images.requires_grad or model.motion.exposures[0].requires_grad):
         for block in blocks:
             solve(block)
     else:
-        threads = min(Partition.threads(frames.device), len(blocks))
-
-        def share(thread: int) -> None:
-            for block in blocks[thread::threads]:
-                solve(block)
-
-        in_parallel(share, range(threads), frames.device)
+        in_parallel(solve, blocks, model.images.device, at_most=MOST_THREADS)
     return torch.stack([found[number] for number in range(len(scenes.stack))]), differences
 
 

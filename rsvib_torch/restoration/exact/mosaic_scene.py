@@ -135,11 +135,8 @@ def restore_mosaic(given: MovingFrames, colours: Tensor, options: ExactOptions) 
     # 1. Check the options, and list the frames of each result.
     frames, motion, ignore, clipped = given.images, given.motion, given.ignore, given.clipped
     height, width = frames.shape[-2:]
-    factor, scale = options.regularisation, options.scale
-    check_prior(options.prior, scale=scale, mosaic=True)
+    check_prior(options.prior, scale=options.scale, mosaic=True)
     groups = joint_groups(frames.shape[1], options.joint)
-    partition = Partition(options.chunk_frequencies, options.segments)
-    stated = None if options.noise == "auto" else max(options.noise, MIN_LEVEL)
     # 2. The displacement of each row during its exposure, and the period that it requires.
     displacement, node_weights = motion.exposures
     length = scene_period(motion, width)
@@ -152,10 +149,10 @@ def restore_mosaic(given: MovingFrames, colours: Tensor, options: ExactOptions) 
         floor = None if clipped is None else torch.where(measured & clipped[stack], mosaic, -torch.inf)
         if ignore is not None:
             measured = measured & ~ignore[stack]
-        if stated is None:  # of colours whose noise was halved by interpolation
+        if options.noise == "auto":  # of colours whose noise was halved by interpolation
             level = 2 * noise_levels(linear.detach()[None], motion.of([stack])).square().mean().sqrt()
         else:
-            level = torch.as_tensor(stated, dtype=frames.dtype, device=frames.device)
+            level = torch.as_tensor(max(options.noise, MIN_LEVEL), dtype=frames.dtype, device=frames.device)
         # 4. The scene of each group of frames; its colours are interpolated first if the frames do not determine them.
         for members, reference in groups:
             shift = motion.shift[stack, members] - motion.shift[stack, reference]
@@ -172,7 +169,7 @@ def restore_mosaic(given: MovingFrames, colours: Tensor, options: ExactOptions) 
                 part = part.demosaiced(mosaic[members], measures(colours[stack][:1])[0])
             kernels = FinerObservation.kernels_of_rows(moved, node_weights, frames.new_ones(len(members)), height)
             observation = FinerObservation(kernels, height, length, frames.dtype)
-            images.append(part.restored(observation, shift[:, 0], stated is None, factor, partition, scale))
+            images.append(part.restored(observation, shift[:, 0], options))
             advance()
     return torch.stack(images).unflatten(0, (-1, len(groups)))
 
@@ -197,15 +194,7 @@ class _Frames:
         images = similar_patches(self.images, values, pattern, self.level, rounds=8, steps=6)
         return replace(self, images=images, measured=torch.ones_like(self.measured), floor=None, level=self.level / 2)
 
-    def restored(
-        self,
-        observation: FinerObservation,
-        along: Tensor,
-        unknown_level: bool,
-        regularisation: float,
-        partition: Partition,
-        scale: int,
-    ) -> Tensor:
+    def restored(self, observation: FinerObservation, along: Tensor, options: ExactOptions) -> Tensor:
         """Colours (3, scale H, scale W) of the scene.
 
         ``along`` (M,) are px by which the frames are moved along the rows relative to the restored one. An unknown
@@ -213,6 +202,7 @@ class _Frames:
         """
         # 1. Deviations from the mean, extended to the period, and the weights of the measured and of the filled values.
         count, width, level = len(self.images), self.images.shape[-1], self.level
+        scale, partition = options.scale, Partition(options.chunk_frequencies, options.segments)
         mean = self.images.mean((0, 2, 3))[:, None, None]
         data = extend_rows(self.images - mean, self.length)
         inside = measured_values(along[None], None, data[None].shape, width, ends=True)[0]
@@ -228,7 +218,7 @@ class _Frames:
         # 2. Fit twice, with priors fitted to predicted instead of interpolated colours: 1 to 3 dB for eight frames. The
         # interpolated ones lack detail, so that their prior is too strong: 0.01 instead of 1 gains 2 to 3 dB for eight
         # frames, 1.4 dB for two, 0.1 dB for one (noise 0.002; 0.0 dB at noise 0.01).
-        first = solver(0.01 * regularisation)
+        first = solver(0.01 * options.regularisation)
         coefficients = first.fit(data, iterations=12)
         gain = None
         with torch.no_grad():
@@ -236,7 +226,7 @@ class _Frames:
             full = torch.where(self.measured, full, predicted[..., :width] + mean)
             if count > 1:
                 residual_level, gain = _residual_level(first, data - predicted, measured)
-                if unknown_level:
+                if options.noise == "auto":
                     level = residual_level
                 elif bool(residual_level > 1.5 * level):
                     warn_of_restoration(
@@ -246,7 +236,7 @@ class _Frames:
                     )
             if self.floor is not None:  # saturated values are lower bounds: only those above the prediction count
                 measured[..., :width] &= (predicted[..., :width] + mean <= self.floor) | self.floor.isinf()
-        second = solver(regularisation)
+        second = solver(options.regularisation)
         scene = second.image(second.fit(data, coefficients, iterations=20)) + mean
         scene = scene[:, :: SCALE // scale, : SCALE * width : SCALE // scale]
         if gain is None:
