@@ -154,8 +154,7 @@ def restore(
     if options.check:  # before frames are sharpened: the verdict compares them with raw frames, blurred by the optics
         with threads_for(prepared.images):
             _warn_if_worse(prepared, restored, motion, options.joint)
-    if camera is not None:
-        restored = sharpened(restored, camera, options.scale)
+    restored = sharpened(restored, camera, options.scale)
     if left_alone and not bool((moves := vibration.moving_axes().any(-1)).all()):  # as such a stack alone
         as_taken = _as_taken(prepared, options.joint, options.scale)
         restored = torch.where(moves[:, None, None, None, None], restored, as_taken)
@@ -208,9 +207,8 @@ def restore_each(
         moved = trusted.mapped(lambda values: values[moving]).to_row_order(timing).to(result.device)
         every = MovingFrames.of(frames, frame_motion(moved, timing.in_row_order(), 1, height))
         restored = _restored(every.mapped(lambda values: values.flatten(0, 1)[moving][:, None]), options)[:, 0]
-        camera = check_optics(options.optics)
         flat = result.flatten(0, 1)
-        flat[moving] = restored if camera is None else sharpened(restored, camera, options.scale)
+        flat[moving] = sharpened(restored, check_optics(options.optics), options.scale)
         result = flat.unflatten(0, (stacks, count))
     nowhere = [name for name, moves in zip(AXIS_NAMES, axes.any(0).tolist(), strict=False) if not moves]
     first = {reason.axis: reason for reason in reversed(left_alone)}
