@@ -131,8 +131,9 @@ def projected_information(recording: Recording, *, margin: int = _MARGIN) -> Ten
     return images @ images.T
 
 
-def _within_band(scene: Tensor, low: float = 0.35, high: float = 0.45) -> Tensor:
-    """The scene without its detail above ``high`` cycles per row, where the spline across rows has aliases."""
+def _within_band(scene: Tensor) -> Tensor:
+    """The scene without its detail above 0.45 cycles per row, where the spline across rows has aliases."""
+    low, high = 0.35, 0.45  # cycles per row, between which detail is attenuated
     length = fast_length(len(scene) + 2 * _MARGIN)
     spectra = torch.fft.rfft(extend_rows(scene.T, length, hold=0.0))
     v = torch.fft.rfftfreq(length, dtype=scene.dtype, device=scene.device)

@@ -80,8 +80,10 @@ def threads_for(images: Tensor) -> Iterator[None]:
         _allowed.reset(token)
 
 
-def in_parallel(work: Callable[[Item], Result], items: Iterable[Item], device: torch.device) -> list[Result]:
-    """Call a function for every item, on a CPU in as many threads as PyTorch may use, without gradients.
+def in_parallel(
+    work: Callable[[Item], Result], items: Iterable[Item], device: torch.device, *, at_most: int | None = None
+) -> list[Result]:
+    """Call a function for every item, on a CPU in as many threads as PyTorch may use, or fewer, without gradients.
 
     The threads share the number of threads that PyTorch may use within each operation. On other devices, or with one
     thread, it is a plain loop.
@@ -89,7 +91,7 @@ def in_parallel(work: Callable[[Item], Result], items: Iterable[Item], device: t
     items = list(items)
     within = torch.get_num_threads()
     allowed = allowed_threads()
-    threads = min(allowed, len(items)) if device.type == "cpu" else 1
+    threads = min(allowed, len(items), at_most or allowed) if device.type == "cpu" else 1
     if threads <= 1:
         with torch.no_grad():
             return [work(item) for item in items]

@@ -76,13 +76,15 @@ def target_optics(scale: int) -> Optics:
     return Optics(sigma=0.5 / scale, pixel=1.0 / scale)
 
 
-def sharpened(images: Tensor, optics: Optics, scale: int) -> Tensor:
+def sharpened(images: Tensor, optics: Optics | None, scale: int) -> Tensor:
     """Restored frames (..., S H, S W) with the response of ``target_optics`` instead of that of a camera.
 
     The restored frames are the posterior mean of the scene after the optics of the camera, and that of what follows by
     a linear filter is the filtered one, so that the prior limits the gain of noise. The filter is ``max(1, H_target /
-    max(H_camera, 0.1))``: frequencies that the camera transmits better are not changed.
+    max(H_camera, 0.1))``: frequencies that the camera transmits better are not changed. Without ``optics``, none are.
     """
+    if optics is None:
+        return images
 
     def gain(u: Tensor, v: Tensor) -> Tensor:
         response = optics.transfer(scale * u, scale * v).clamp(min=_LEAST_RESPONSE)

@@ -149,9 +149,7 @@ def _form_frames(scene: Tensor, starts: Tensor, timing: RowTiming, motion: Motio
     return strips.joined(torch.stack(formed))[0]
 
 
-def _form_rows(
-    scene: Tensor, starts: Tensor, timing: RowTiming, motion: Motion, width: int, chunk_rows: int = _CHUNK_ROWS
-) -> Tensor:
+def _form_rows(scene: Tensor, starts: Tensor, timing: RowTiming, motion: Motion, width: int) -> Tensor:
     """Form frames (T, ..., R, width) whose rows are exposed from ``starts`` (T, R) on, centred on the scene."""
     height, scene_width = scene.shape[-2:]
     num_rows = starts.shape[-1]
@@ -160,10 +158,8 @@ def _form_rows(
     spectra = torch.fft.rfft(extend_rows(bspline_coefficients(scene, _DEGREE, -2), length, hold=0.0))
     frequencies = torch.fft.rfftfreq(length, dtype=torch.float64, device=scene.device)
 
-    rows = torch.arange(num_rows, device=scene.device)
     formed = []
-    for begin in range(0, num_rows, chunk_rows):
-        chunk = rows[begin : begin + chunk_rows]
+    for chunk in torch.arange(num_rows, device=scene.device).split(_CHUNK_ROWS):
         displacement, node_weights = exposure_trajectory(motion, starts[:, chunk], timing, "gauss")
         places = top + chunk[:, None] - displacement[..., 1]
         row_spectra = form_rows(spectra, places, displacement[..., 0], node_weights, frequencies, _DEGREE)

@@ -17,7 +17,7 @@ from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
 from rsvib_torch.numerics.fourier import extend_rows, extended_length, squared_modulus, waves
 from rsvib_torch.numerics.splines import bspline_weights, mirrored
 from rsvib_torch.options import BandedOptions
-from rsvib_torch.restoration.frame_motion import FrameMotion
+from rsvib_torch.restoration.frame_motion import FrameMotion, MovingFrames
 from rsvib_torch.restoration.noise import estimate_noise
 
 
@@ -81,15 +81,16 @@ def _aligned_spectra(frames: Tensor, motion: FrameMotion, u: Tensor, length: int
     return torch.cat(moved).unflatten(0, (B * T, H))
 
 
-def restore_banded(frames: Tensor, motion: FrameMotion, options: BandedOptions) -> Tensor:
-    """Restore frames (B, T, C, H, W) slab by slab (Sec. 3.2 of Liu et al. 2023).
+def restore_banded(given: MovingFrames, options: BandedOptions) -> Tensor:
+    """Restore frames slab by slab (Sec. 3.2 of Liu et al. 2023).
 
     Scene row k appears at frame row r(k). The slab of rows r(k) - l ... r(k) + l, l = ``half_rows``, is assumed to have
     the PSF of that row. It is deconvolved by the Wiener filter ``H* / (|H|^2 + w (4 sin^2 pi u + 4 sin^2 pi v))``, w =
     ``noise_to_signal``, and its central rows are kept. The prior penalises image gradients, which preserves the mean.
     Whole pixels of the displacement shift the slab. Rows are extended smoothly at their ends and mirrored above and
-    below. All pixels count: ``restore`` replaces those without data by local means.
+    below. All pixels count, those without data with their local means.
     """
+    frames, motion = given.images, given.motion
     half_rows = check_whole_number("half_rows", options.half_rows, at_least=1, at_most=max(16, frames.shape[-2]))
     stride = check_whole_number("stride", options.stride, at_least=1, at_most=max(2, frames.shape[-2]))
     interpolation, chunk_rows = options.interpolation, options.chunk_rows

@@ -20,7 +20,7 @@ from rsvib_torch.motion.timing import MAX_ROWS, SensorTiming, check_timing
 from rsvib_torch.numerics.fourier import extend_rows, extended_length, phase_tables, spline_spectra
 from rsvib_torch.numerics.splines import bspline_coefficients, bspline_weights, mirrored
 from rsvib_torch.options import DewarpOptions
-from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion
+from rsvib_torch.restoration.frame_motion import FrameMotion, MovingFrames, frame_motion
 
 _DEGREE = 5  # of the B-spline across rows
 _CHUNK_ROWS = 128  # interpolated at a time
@@ -46,12 +46,13 @@ class _Moves:
         return cls(mirrored(taps, motion.num_rows), weights, *(torch.view_as_real(table) for table in tables))
 
 
-def restore_dewarp(frames: Tensor, motion: FrameMotion, options: DewarpOptions = DewarpOptions()) -> Tensor:  # noqa: B008
-    """Undo the displacement of every row of frames (B, T, C, H, W), not its blur: sufficient for short exposures.
+def restore_dewarp(given: MovingFrames, options: DewarpOptions = DewarpOptions()) -> Tensor:  # noqa: B008
+    """Undo the displacement of every row of frames, not its blur: sufficient for short exposures.
 
     Scene row s is interpolated at frame row r(s) by a quintic B-spline across rows and moved back along the row by the
     mean displacement (Eq. 2) of that row with a phase ramp. Noise is not amplified.
     """
+    frames, motion = given.images, given.motion
     length = extended_length(frames.shape[-1], motion.displacement_bound())
     moves = _Moves.of(motion, length, frames.dtype)
     spectra = torch.view_as_real(spline_spectra(frames, _DEGREE, length))

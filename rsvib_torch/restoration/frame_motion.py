@@ -8,9 +8,10 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -20,6 +21,7 @@ from torch import Tensor
 from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.values import check_whole_number
 from rsvib_torch.files.free_memory import check_fits
+from rsvib_torch.files.reading import Table
 from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.frames.prepare import PreparedFrames
@@ -144,6 +146,29 @@ def motion_of_frames(frames: PreparedFrames, vibration: Motion) -> FrameMotion:
     return frame_motion(motion, frames.timing, count, height)
 
 
+@dataclass(frozen=True, eq=False)
+class MovingFrames:
+    """Frames of B stacks in row order, as a restoration method takes them: with their motion and masks."""
+
+    images: Tensor  # (B, T, C, H, W) float32 or float64, full scale 1, finite; local means at missing pixels
+    motion: FrameMotion
+    ignore: Tensor | None = None  # bool tensor shaped like the images, pixels without data; None for none
+    clipped: Tensor | None = None  # likewise, saturated pixels, whose values are lower bounds
+    colours: Tensor | None = None  # (B, T, 1, H, W), the colour 0 to 2 that each pixel of a mosaic measures
+    strips: int = 1  # number of neighbouring stacks that are strips of columns of the same frames
+
+    @classmethod
+    def of(cls, frames: PreparedFrames, motion: FrameMotion) -> "MovingFrames":
+        """Prepared frames with their motion."""
+        return cls(frames.filled, motion, frames.missing, frames.saturated, frames.colours)
+
+    def mapped(self, change: Callable[[Tensor], Tensor], **stated: Any) -> Self:
+        """The frames with a change of images and masks, and other values of further fields."""
+        tensors = ((field.name, getattr(self, field.name)) for field in fields(self))
+        changed: Table = {name: change(values) for name, values in tensors if isinstance(values, Tensor)}
+        return replace(self, **changed, **stated)
+
+
 @checks_arguments
 def visible_pixels(
     timing: SensorTiming, vibration: Motion, size: tuple[int, int], num_frames: int
@@ -245,30 +270,18 @@ def _strips(motion: Motion, size: tuple[int, int], first: float, last: float) ->
     return strips, slope * math.hypot(strips.width / math.sqrt(12), distance)
 
 
-def restore_in_strips(
-    method: Callable[..., Tensor], images: Tensor, motion: FrameMotion, options: Mapping[str, object]
-) -> Tensor:
-    """Frames restored by one of ``METHODS``, in strips of columns if the motion has roll or zoom.
-
-    Options that are shaped like the images are cut as well, and ``strips`` becomes the number of strips, if the method
-    has that option.
-    """
-    count, (height, width) = images.shape[1], images.shape[-2:]
+def restore_in_strips(method: Callable[[MovingFrames, Any], Tensor], frames: MovingFrames, options: object) -> Tensor:
+    """Frames restored by one of ``METHODS``, in strips of columns if the motion has roll or zoom."""
+    motion, timing = frames.motion, frames.motion.timing
+    count, (height, width) = frames.images.shape[1], frames.images.shape[-2:]
     if motion.vibration.same_for_all_columns:
         motion.check_fits(width)
-        return method(images, motion, **options)
-    timing, starts = motion.timing, motion.frame_starts.tolist()
+        return method(frames, options)
+    starts = motion.frame_starts.tolist()
     end = starts[-1] + height * timing.row_time + timing.exposure_time
     strips, neglected = _strips(motion.vibration, (height, width), starts[0], end)
     of_strips = ColumnMotion.of_columns(motion.vibration, strips.columns, timing, count, height)
-    cut = {
-        name: strips.cut(value) if isinstance(value, Tensor) and value.shape[-2:] == images.shape[-2:] else value
-        for name, value in options.items()
-    }
-    of_frames = frame_motion(of_strips, timing, count, height)
-    of_frames = replace(of_frames, neglected=neglected)
+    of_frames = replace(frame_motion(of_strips, timing, count, height), neglected=neglected)
     of_frames.check_fits(width)
-    if "strips" in cut:
-        cut["strips"] = len(strips.firsts)
-    restored = method(strips.cut(images), of_frames, **cut)
+    restored = method(frames.mapped(strips.cut, motion=of_frames, strips=len(strips.firsts)), options)
     return strips.finer(restored.shape[-1] // strips.width).joined(restored)

@@ -36,12 +36,6 @@ def _cut_squares(images: Tensor, counts: Sequence[int]) -> Tensor:
     return cut_pieces(images, tops, lefts, (_SIDE, _SIDE))
 
 
-def _tapered(squares: Tensor) -> Tensor:
-    """Squares minus their means, times a Hann window under which the power of white noise is its variance."""
-    window = constant(taper, _SIDE, dtype=squares.dtype, device=squares.device)
-    return (squares - squares.mean((-2, -1), keepdim=True)) * window * window[:, None]
-
-
 def _mostly_measured(missing: Tensor, dims: tuple[int, ...]) -> Tensor:
     """Parts of images that count, by the share of their pixels that is missing.
 
@@ -213,9 +207,8 @@ def _residual_power(images: Tensor, displacement: Tensor, node_weights: Tensor) 
     sample = sample_rows(images, kernels, chosen)
     # correlation 0.9 of neighbouring rows of the scene, of weight 1e-4 beside the data
     products = torch.tensor([[1.0, 0.9**2], [-0.9, 0.0]], dtype=torch.float64, device=images.device)
-    explained = sample.explain(1e-4 * products[None, :, :, None, None].expand(-1, -1, -1, len(images), count))
-    freedom = explained.count * count - explained.freedom[0].sum(-1)
-    return torch.as_tensor(explained.power[0].sum(-1) / freedom, dtype=images.dtype, device=images.device)
+    power, rest = sample.unexplained(1e-4 * products[None, :, :, None, None].expand(-1, -1, -1, len(images), count))
+    return torch.as_tensor(power[0].sum(-1) / rest[0].sum(-1), dtype=images.dtype, device=images.device)
 
 
 # One frame: noise is white, the spectrum of a scene falls
@@ -267,8 +260,10 @@ def noise_floor(frames: Tensor, ignore: Tensor | None = None) -> Tensor:
 def _spectrum(images: Tensor, ignore: Tensor | None) -> Tensor:
     """Mean power (N, V, U) of squares of images (N, H, W); the power of white noise is its variance."""
     counts = [min(2 * extent // _SIDE - 1, 6) for extent in images.shape[-2:]]
-    squares = _tapered(_cut_squares(images, counts).flatten(1, 2))
-    power = squared_modulus(torch.fft.rfft2(squares)).to(torch.float64)
+    squares = _cut_squares(images, counts).flatten(1, 2)
+    window = constant(taper, _SIDE, dtype=squares.dtype, device=squares.device)
+    tapered = (squares - squares.mean((-2, -1), keepdim=True)) * window * window[:, None]
+    power = squared_modulus(torch.fft.rfft2(tapered)).to(torch.float64)
     if ignore is None:
         return power.mean(1)
     missing = _cut_squares(ignore, counts).double().mean((-2, -1)).flatten(1)

@@ -2,8 +2,8 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,7 +11,6 @@ from torch import Tensor
 from rsvib_torch.checks.arrays import ArrayLike
 from rsvib_torch.execution.parallel import threads_for
 from rsvib_torch.execution.precision import full_precision, outside_graphs
-from rsvib_torch.files.reading import Table
 from rsvib_torch.frames.entry_points import TimedModule, module_options, vibration_options
 from rsvib_torch.frames.mosaic import interpolated_colours
 from rsvib_torch.frames.pixels import enlarged
@@ -26,8 +25,13 @@ from rsvib_torch.options import OpticsOptions, RestorationOptions, RestoreOption
 from rsvib_torch.restoration.banded import restore_banded
 from rsvib_torch.restoration.dewarp import restore_dewarp
 from rsvib_torch.restoration.exact.exact import restore_exact
-from rsvib_torch.restoration.exact.mosaic_scene import restore_mosaic
-from rsvib_torch.restoration.frame_motion import FrameMotion, motion_of_frames, restore_in_strips
+from rsvib_torch.restoration.frame_motion import (
+    FrameMotion,
+    MovingFrames,
+    frame_motion,
+    motion_of_frames,
+    restore_in_strips,
+)
 from rsvib_torch.restoration.restoration_warning import warn_of_restoration
 from rsvib_torch.restoration.richardson_lucy import restore_richardson_lucy
 from rsvib_torch.restoration.verdict.judge import judge_stacks
@@ -36,50 +40,27 @@ from rsvib_torch.restoration.verdict.trust import trusted_vibration, vibration_t
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
 
-
-@dataclass(frozen=True)
-class RestorationMethod:
-    """An entry of ``METHODS``."""
-
-    function: Callable[..., Tensor]  # the method, see the contract above ``METHODS``
-    # masks that it takes: ``"ignore"`` (pixels without data), ``"clipped"`` (saturated pixels)
-    masks: tuple[Literal["ignore", "clipped"], ...] = ()
-    # whether it takes ``strips``, and estimates once what strips of the same frames have in common
-    strips: bool = False
-    # the method for colour mosaics, which has the same options and takes ``colours``; None for none
-    mosaic: "RestorationMethod | None" = None
-
-
 # Restoration methods. A method is called as
 #
-#     function(frames, motion, options, *, ignore=None, clipped=None) -> Tensor
+#     function(frames: MovingFrames, options) -> Tensor
 #
-#     frames: (B, T, C, H, W) float32 or float64 in row order, full scale 1, finite; local means at missing pixels.
-#     motion: FrameMotion of the B stacks, whose displacement depends on the row only: frames with roll or zoom are cut
-#         into strips of columns, which are stacks of one batch.
+#     frames: B stacks, whose displacement depends on the row only: frames with roll or zoom are cut into strips of
+#         columns, which are stacks of one batch. A method need not use the masks: pixels without data then count as
+#         measured with their local means, saturated ones with their values. Only methods whose group has the option
+#         ``mosaic`` receive ``colours``, and those with ``optics`` must estimate the scene after the optics.
 #     options: the group of its options, in ``METHOD_OPTIONS`` of options.py.
-#     ignore, clipped: bool tensors shaped like the frames, passed only if listed in ``masks`` and such pixels exist.
-#         Without ``"ignore"``, the local means count as measured; without ``"clipped"``, saturated pixels do.
-#     strips: number of neighbouring stacks that are strips of the same frames, passed only if declared.
-#     colours: integer tensor shaped like the frames, the colour that each pixel of a mosaic measures; passed
-#         to ``mosaic`` only. Methods without it, and those whose result does not estimate the scene after the optics,
-#         have no options ``mosaic`` and ``optics``.
 #     returns: frames at rest, of the same shape and dtype, in the coordinates of ``motion.shift``; (B, 1, C, H, W) for
 #         option ``joint=True``, and (..., S H, S W) for option ``scale=S``, with point (S i, S j) at pixel (i, j).
 #
 # Frames of one stack must not affect other stacks, but for the length to which rows are extended; ``frames`` must not
 # be changed, and gradients must flow to frames and motion. Recipe of a new method: docs/architecture.md.
-METHODS: dict[str, RestorationMethod] = {
-    "exact": RestorationMethod(
-        restore_exact,
-        masks=("ignore", "clipped"),
-        strips=True,
-        mosaic=RestorationMethod(restore_mosaic, masks=("ignore", "clipped")),
-    ),
-    "banded": RestorationMethod(restore_banded),
-    "dewarp": RestorationMethod(restore_dewarp),
-    "richardson-lucy": RestorationMethod(restore_richardson_lucy, masks=("ignore",)),
+METHODS: dict[str, Callable[[MovingFrames, Any], Tensor]] = {
+    "exact": restore_exact,
+    "banded": restore_banded,
+    "dewarp": restore_dewarp,
+    "richardson-lucy": restore_richardson_lucy,
 }
+WITH_SATURATION = ("exact",)  # methods that use ``clipped``
 
 
 def check_optics(optics: OpticsOptions | None) -> Optics | None:
@@ -169,12 +150,11 @@ def restore(
     if left_alone and not bool(vibration.moving_axes().any()):
         return unchanged_frames(prepared, options.joint, options.scale)
     motion = motion_of_frames(prepared, vibration)
-    restored = _restored(prepared, motion, options)
+    restored = _restored(MovingFrames.of(prepared, motion), options)
     if options.check:  # before frames are sharpened: the verdict compares them with raw frames, blurred by the optics
         with threads_for(prepared.images):
             _warn_if_worse(prepared, restored, motion, options.joint)
-    if camera is not None:
-        restored = sharpened(restored, camera, options.scale)
+    restored = sharpened(restored, camera, options.scale)
     if left_alone and not bool((moves := vibration.moving_axes().any(-1)).all()):  # as such a stack alone
         as_taken = _as_taken(prepared, options.joint, options.scale)
         restored = torch.where(moves[:, None, None, None, None], restored, as_taken)
@@ -185,24 +165,17 @@ def restore(
 @full_precision
 def restore_prepared(frames: PreparedFrames, vibration: Motion, options: RestorationOptions) -> Tensor:
     """``restore`` of prepared frames by a motion in image axes, (B, T, C, H, W) in row order, without any checks."""
-    return _restored(frames, motion_of_frames(frames, vibration), options)
+    return _restored(MovingFrames.of(frames, motion_of_frames(frames, vibration)), options)
 
 
-def _restored(frames: PreparedFrames, motion: FrameMotion, options: RestorationOptions) -> Tensor:
-    """Frames restored with their motion, with the masks that the method takes."""
-    method = METHODS[options.method]
-    chosen = method if frames.colours is None else method.mosaic
-    assert chosen is not None, "methods without mosaic have no option mosaic"
-    masks = {"ignore": frames.missing, "clipped": frames.saturated}
-    more: Table = {name: masks[name] for name in chosen.masks if masks[name] is not None}
-    if frames.colours is not None:
-        more["colours"] = frames.colours
-    if chosen.strips:
-        more["strips"] = 1
+def _restored(frames: MovingFrames, options: RestorationOptions) -> Tensor:
+    """Restored frames (B, T, C, H, W) by the method of the options."""
     with threads_for(frames.images):
-        return restore_in_strips(chosen.function, frames.filled, motion, {"options": options, **more})
+        return restore_in_strips(METHODS[options.method], frames, options)
 
 
+@outside_graphs
+@full_precision
 def restore_each(
     frames: PreparedFrames, followed: FollowedVibration, options: RestorationOptions
 ) -> tuple[Tensor, Vibration, tuple[Reason, ...]]:
@@ -223,32 +196,19 @@ def restore_each(
     if frames.batched:
         findings = tuple(one for stack in followed.findings for one in stack)
         followed = replace(followed.mapped(lambda values: values.flatten(0, 1)), findings=findings)
-    moved = followed.vibration.timed_from(followed.times)
+    vibration = followed.vibration.timed_from(followed.times)
     timing = replace(frames.image_timing, frame_start_times=(-frames.timing.time_to_middle(height),))
-    trusted, left_alone = trusted_vibration(replace(followed, vibration=moved), timing, 1, height)
+    trusted, left_alone = trusted_vibration(replace(followed, vibration=vibration), timing, 1, height)
     axes = trusted.moving_axes()
     # 2. Only frames that move are restored.
     result = _as_taken(frames, False, options.scale)
     moving = axes.any(-1)
     if bool(moving.any()):
-
-        def moved_frames(values: Tensor) -> Tensor:
-            return values.flatten(0, 1)[moving][:, None]
-
-        apart = replace(
-            frames,
-            images=moved_frames(frames.images),
-            missing=None if frames.missing is None else moved_frames(frames.missing),
-            saturated=None if frames.saturated is None else moved_frames(frames.saturated),
-            colours=None if frames.colours is None else moved_frames(frames.colours),
-            timing=timing.in_row_order(),
-            image_timing=timing,
-            shape=(int(moving.sum()), 1, *frames.shape[-3:]),
-        )
-        restored = restore_prepared(apart, trusted.mapped(lambda values: values[moving]), options)[:, 0]
-        camera = check_optics(options.optics)
+        moved = trusted.mapped(lambda values: values[moving]).to_row_order(timing).to(result.device)
+        every = MovingFrames.of(frames, frame_motion(moved, timing.in_row_order(), 1, height))
+        restored = _restored(every.mapped(lambda values: values.flatten(0, 1)[moving][:, None]), options)[:, 0]
         flat = result.flatten(0, 1)
-        flat[moving] = restored if camera is None else sharpened(restored, camera, options.scale)
+        flat[moving] = sharpened(restored, check_optics(options.optics), options.scale)
         result = flat.unflatten(0, (stacks, count))
     nowhere = [name for name, moves in zip(AXIS_NAMES, axes.any(0).tolist(), strict=False) if not moves]
     first = {reason.axis: reason for reason in reversed(left_alone)}

@@ -13,12 +13,10 @@ from rsvib_torch.imaging.blur import RowPSF, RowVaryingBlur, trajectory_psf
 from rsvib_torch.numerics.splines import correlated, mirrored
 from rsvib_torch.options import RichardsonLucyOptions
 from rsvib_torch.restoration.dewarp import restore_dewarp
-from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
+from rsvib_torch.restoration.frame_motion import MovingFrames, joint_groups
 
 
-def restore_richardson_lucy(
-    frames: Tensor, motion: FrameMotion, options: RichardsonLucyOptions, *, ignore: Tensor | None = None
-) -> Tensor:
+def restore_richardson_lucy(given: MovingFrames, options: RichardsonLucyOptions) -> Tensor:
     """Restore frames by Richardson-Lucy iterations on the row-varying blur; negative values count as 0.
 
     ``c <- c K^T(m g / K c) / K^T m`` increases the likelihood of the scene for Poisson counts g of the measured pixels
@@ -27,14 +25,14 @@ def restore_richardson_lucy(
     initial scene is the result of ``restore_dewarp``; fewer iterations amplify less noise. For several frames of one
     scene, ``sum K^T(m g / K c) / sum K^T m`` is used, and their mean is the initial scene.
     """
-    iterations = options.iterations
+    frames, motion, iterations = given.images, given.motion, options.iterations
     B, T, _, _, W = frames.shape
     groups = joint_groups(T, options.joint)
     psf = trajectory_psf(*motion.exposures, interpolation="cubic")
     weights = psf.weights.to(frames.dtype)[:, :, None]
-    measured = torch.ones_like(frames) if ignore is None else (~ignore).to(frames.dtype)
+    measured = torch.ones_like(frames) if given.ignore is None else (~given.ignore).to(frames.dtype)
     counts = frames.clamp(min=0.0)
-    dewarped, shift = restore_dewarp(frames, motion), motion.shift.to(torch.int64)
+    dewarped, shift = restore_dewarp(given), motion.shift.to(torch.int64)
     # degree 1: the kernels act on the coefficients themselves
     if all(members == [reference] for members, reference in groups):
         kernels = RowPSF((psf.first_tap - shift[:, :, None])[:, :, None, None], weights[:, :, None], 1)

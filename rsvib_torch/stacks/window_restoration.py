@@ -78,7 +78,7 @@ def restore_trusted(
         if len(frames) > 1:
             verdict = judge_prepared(prepared, restored, vibration, joint=joint, most_pairs=most_pairs)
     keep = verdict is None or verdict.overall != "worse" or force
-    if keep and optics is not None:
+    if keep:
         restored = sharpened(restored, optics, scale)
     result = prepared.from_row_order(restored) if keep else unchanged_frames(prepared, joint, scale)
     return RestoredFrames(result, keep, left_alone, verdict, True, vibration.num_axes)

@@ -58,7 +58,7 @@ from rsvib_torch.options import MAX_TONES, DetectionMethod, RegistrationOptions,
 from rsvib_torch.registration.gradients import RowGradients
 from rsvib_torch.registration.register import fits_frame
 from rsvib_torch.registration.row_spectra import RowSpectra
-from rsvib_torch.restoration.restore import METHODS
+from rsvib_torch.restoration.restore import WITH_SATURATION
 from rsvib_torch.results.reason import Reason
 from rsvib_torch.tracking.tone_filter import ToneFilter
 from rsvib_torch.tracking.tracked_frame import TrackedFrame, TrackedTones, TrackingState, displacement_std_at_frame
@@ -225,7 +225,7 @@ class VibrationTracker:
                 self.timing,
                 full_scale=self.options.full_scale,
                 channels=self.options.channels,
-                saturation=self.options.saturation if "clipped" in METHODS[self.options.method].masks else None,
+                saturation=self.options.saturation if self.options.method in WITH_SATURATION else None,
             )
             latest = _GreyFrame.of(prepared, time)
         before = self._state.frames[-1] if self._state.frames else None

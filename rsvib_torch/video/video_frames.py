@@ -27,7 +27,7 @@ from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.numerics.splines import mirrored
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import RestorationOptions
-from rsvib_torch.restoration.restore import METHODS, restore_prepared
+from rsvib_torch.restoration.restore import WITH_SATURATION, restore_prepared
 from rsvib_torch.stacks.job import StackJob
 from rsvib_torch.video import Margins
 
@@ -181,7 +181,7 @@ class VideoFrames:
         if saturation is not None and self.picture is not None:
             black, white = self.picture.levels
             saturation = (black + saturation * (white - black)) / 255.0
-        if "clipped" not in METHODS[self.options.method].masks:
+        if self.options.method not in WITH_SATURATION:
             saturation = None
         prepared = prepare_frames(images, timing, saturation=saturation, channels="first")
         with torch.no_grad():

@@ -1,4 +1,3 @@
-import pytest
 import torch
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
@@ -9,16 +8,8 @@ TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
 NOISE = 0.003
 
 
-def as_tensor(array, dtype=torch.float32):
-    return torch.from_numpy(array).to(dtype)
-
-
-@pytest.fixture(scope="module")
-def short():
-    """A short stack for tests of invariances: scene, frames and motion."""
-    motion = Motion()
-    scene = draw_scene(256, 192, seed=11)
-    return crop(scene), take_frames(scene, TIMING, motion, 2, NOISE), motion
+def restored_by(frames, motion, **options):
+    return restore(torch.from_numpy(frames).float(), TIMING, motion.vibration(), method="banded", **options)
 
 
 def test_gain_exceeds_12_db_in_both_frames_of_the_paper_camera():
@@ -26,8 +17,7 @@ def test_gain_exceeds_12_db_in_both_frames_of_the_paper_camera():
     scene = draw_scene(2048, 336, 101)
     frames = take_frames(scene, TIMING, motion, 2, NOISE, seed=101)
     truth = crop(scene)
-    restored = restore(as_tensor(frames), TIMING, motion.vibration(), method="banded").numpy()
-    halfway = restore(as_tensor(frames), TIMING, motion.scaled(0.5).vibration(), method="banded").numpy()
+    restored, halfway = (restored_by(frames, used).numpy() for used in (motion, motion.scaled(0.5)))
     for frame, good, half in zip(frames, restored, halfway, strict=True):
         before = decibel(frame, truth)
         assert decibel(good, truth) > before + 20
@@ -35,12 +25,10 @@ def test_gain_exceeds_12_db_in_both_frames_of_the_paper_camera():
     assert decibel(restored[0], truth) > 48.5  # a still camera has 50.5
 
 
-def test_linear_interpolation_of_the_paper_blurs(short):
-    truth, frames, motion = short
-    linear, cubic = (
-        decibel(restore(as_tensor(frames), TIMING, motion.vibration(), method="banded", interpolation=name), truth)
-        for name in ("linear", "cubic")
-    )
+def test_linear_interpolation_of_the_paper_blurs():
+    scene = draw_scene(256, 192, seed=11)
+    truth, frames = crop(scene), take_frames(scene, TIMING, Motion(), 2, NOISE)
+    linear, cubic = (decibel(restored_by(frames, Motion(), interpolation=name), truth) for name in ("linear", "cubic"))
     assert decibel(frames, truth) + 12 < linear < cubic - 1
 
 

@@ -13,7 +13,7 @@ from rsvib_torch.restoration import visible_pixels
 from rsvib_torch.restoration.exact.exact import model_frames
 from rsvib_torch.restoration.exact.priors import PRIORS, Prior
 from rsvib_torch.restoration.exact.scene_solver import Partition
-from rsvib_torch.restoration.frame_motion import frame_motion
+from rsvib_torch.restoration.frame_motion import MovingFrames, frame_motion
 
 restore = partial(restore_by_any_method, method="exact")
 TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
@@ -178,7 +178,7 @@ def test_boundary_extensions_are_filled_at_the_ends_of_the_rows_only():
 
     # the inner one of three strips ends where it has no weight
     of_three = frame_motion(motion.expanded(3), timing.in_row_order(), 1, 192)
-    inner = model_frames((frame + noise).expand(3, 1, 1, -1, -1), of_three, noise=0.005, strips=3)
+    inner = model_frames(MovingFrames((frame + noise).expand(3, 1, 1, -1, -1), of_three, strips=3), noise=0.005)
     filled, not_filled = (psnr(at_ends(image), at_ends(expected[0]), 1.0) for image in solved(inner)[:2])
     assert filled > not_filled + 0.5
     assert inner.kinds(inner.scenes([([0], 0)])) == ["extension", "nothing", "extension"]

@@ -19,38 +19,31 @@ from torch import Tensor
 from rsvib_torch.execution.chunking import at_once, runs
 from rsvib_torch.execution.parallel import in_parallel
 from rsvib_torch.execution.progress import steps
-from rsvib_torch.numerics.fourier import extend_rows, extended_length, fast_length
+from rsvib_torch.numerics.fourier import extend_rows
 from rsvib_torch.numerics.tables import table, tables, take_stacks
 from rsvib_torch.options import ExactOptions
 from rsvib_torch.restoration.exact.filling import (
     FILLED_BLUR_REACH,
     measured_values,
+    scene_period,
     with_extension,
     with_missing_values,
 )
 from rsvib_torch.restoration.exact.finer_scene import FrameDifference, finer_scene, warn_of_frames
-from rsvib_torch.restoration.exact.priors import PRIORS, Prior, check_prior
-from rsvib_torch.restoration.exact.scene_solver import Partition, SceneProblem
-from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
+from rsvib_torch.restoration.exact.mosaic_scene import restore_mosaic
+from rsvib_torch.restoration.exact.priors import PRIORS, check_prior
+from rsvib_torch.restoration.exact.scene_solver import MIN_LEVEL, MOST_THREADS, Partition, SceneProblem
+from rsvib_torch.restoration.frame_motion import MovingFrames, joint_groups
 from rsvib_torch.restoration.noise import noise_levels
 from rsvib_torch.restoration.scene_model.cross_validation import prior_strengths
 from rsvib_torch.restoration.scene_model.finer_grid import GRIDS, PolynomialPrior, fit_polynomial_prior
 from rsvib_torch.restoration.scene_model.observation import SCENE_REACH, TAPS, RowKernels
 from rsvib_torch.restoration.scene_model.scene_prior import RowPrior, brightness, fit_prior
 
-MIN_LEVEL = 1e-5  # of full scale, lowest noise level assumed; below, the systems lose digits in single precision
 _FRAME_BYTES = 2**26  # frames of scenes that are treated at a time on a CPU, beside the systems
 
 
-def restore_exact(
-    frames: Tensor,
-    motion: FrameMotion,
-    options: ExactOptions,
-    *,
-    ignore: Tensor | None = None,
-    clipped: Tensor | None = None,
-    strips: int = 1,
-) -> Tensor:
+def restore_exact(frames: MovingFrames, options: ExactOptions) -> Tensor:
     """Restore frames with all rows coupled: the most probable scene for its frames and a prior.
 
     The kernel changes from row to row but not along a row. After a Fourier transform along the rows, the frame g is for
@@ -59,43 +52,30 @@ def restore_exact(
     banded Hermitian positive definite system ``(sum_m w_m K_m^H K_m + P) c = sum_m w_m K_m^H g_m`` per frequency. The
     interpolation error of the kernel counts as noise.
 
-    Arguments and result as above ``METHODS``. Values of missing pixels are estimated from all others; those of
-    saturated pixels are lower bounds, which are held approximately. ``strips`` neighbouring stacks of the batch are
-    strips of columns of the same frames: they have one noise level, and one strength of the prior for each level.
+    Values of missing pixels are estimated from all others; those of saturated pixels are lower bounds, which are held
+    approximately. Strips of columns of the same frames have one noise level, and one strength of the prior for each
+    level. Colour mosaics: ``restore_mosaic``.
     """
     # 1. Check the options, and list the frames of each result.
-    factor, scale, prior = options.regularisation, options.scale, options.prior
-    check_prior(prior, scale=scale)
-    groups = joint_groups(frames.shape[1], options.joint)
-    partition = Partition(options.chunk_frequencies, options.segments)
+    if frames.colours is not None:
+        return restore_mosaic(frames, frames.colours, options)
+    check_prior(options.prior, scale=options.scale)
+    groups = joint_groups(frames.images.shape[1], options.joint)
 
     # 2. Estimate what all scenes of a stack have in common: noise levels and prior.
-    model = model_frames(
-        frames, motion, noise=options.noise, ignore=ignore, clipped=clipped, scale=scale, strips=strips
-    )
+    model = model_frames(frames, noise=options.noise, scale=options.scale)
 
     # 3. Build the scenes of all stacks, and select the strength of the prior of each by cross-validation.
     scenes = model.scenes(groups)
-    scenes = replace(scenes, strength=factor * model.strengths(scenes))
+    scenes = replace(scenes, strength=options.regularisation * model.strengths(scenes))
 
     # 4. Fill missing values, and solve the banded systems of all frequencies.
-    images, differences = solve_scenes(model, scenes, PRIORS[prior], factor, partition)
+    images, differences = solve_scenes(model, scenes, options)
 
     # 5. On the finer grid, frames that contradict their scene show that the motion is wrong.
-    if scale != 1:
+    if options.scale != 1:
         warn_of_frames(differences, model.places(scenes))
-    return images.unflatten(0, (len(frames), -1))
-
-
-def scene_period(motion: FrameMotion, width: int) -> int:
-    """Period in px of the scenes of all stacks with frames of ``width`` px."""
-    lengths = []
-    for bounds, blur in zip(motion.bounds, motion.blur_lengths[..., 0].max(1), strict=True):
-        margin = 8 + math.ceil(bounds[0] + 0.5)  # px beyond the displacement that influence the ends
-        # the boundary extension of blurred rows is filled; that of others is longer
-        filled = blur > 2 * FILLED_BLUR_REACH
-        lengths.append(fast_length(width + 2 * margin) if filled else extended_length(width, margin))
-    return max(lengths)
+    return images.unflatten(0, (len(frames.images), -1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,12 +89,10 @@ class Scenes:
     strength: NDArray[np.float64]  # (N,) factor on the prior
 
 
-@dataclass(frozen=True, eq=False)
-class FrameModel:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FrameModel(MovingFrames):
     """The frames of B stacks, and the quantities that the scenes restored from them have in common."""
 
-    frames: Tensor  # (B, T, C, H, W)
-    motion: FrameMotion  # motion of the frames
     weights: Tensor  # (B, T) weights of the frames
     level: Tensor  # (B,) standard deviation of the noise of a frame of weight 1
     level_is_certain: bool  # whether it is given or estimated from several frames
@@ -123,21 +101,19 @@ class FrameModel:
     period: int  # L, the period of the restored scenes in px
     scale: int  # points of the restored scenes per px
     unknown: Tensor | None  # (B, T, C, H, W) bool, pixels without data and saturated ones; None for none
-    clipped: Tensor | None  # (B, T, C, H, W) bool, the saturated ones
-    strips: int  # number of neighbouring stacks that are strips of columns of the same frames
 
     @cached_property
     def measured(self) -> NDArray[np.float64]:
         """Share (B, T) of the pixels of each frame that are measured."""
         if self.unknown is None:
-            return np.ones(self.frames.shape[:2])
+            return np.ones(self.images.shape[:2])
         return 1.0 - self.unknown.double().flatten(2).mean(2).cpu().numpy()
 
     def scenes(self, groups: list[tuple[list[int], int]]) -> Scenes:
         """The scenes that are restored from groups of frames (``joint_groups``), stack after stack."""
-        stack = np.arange(len(self.frames)).repeat(len(groups))
-        members = np.tile([members for members, _ in groups], (len(self.frames), 1))
-        reference = np.tile([reference for _, reference in groups], len(self.frames))
+        stack = np.arange(len(self.images)).repeat(len(groups))
+        members = np.tile([members for members, _ in groups], (len(self.images), 1))
+        reference = np.tile([reference for _, reference in groups], len(self.images))
         contributes = np.ones(members.shape, dtype=bool)
         if self.unknown is not None:
             # frames with at most 5 % measured pixels do not contribute, unless there are no others
@@ -147,7 +123,7 @@ class FrameModel:
 
     def _indices(self, scenes: Scenes) -> tuple[Tensor, Tensor]:
         """Stack (N, 1) and members (N, M), to index frames."""
-        device = self.frames.device
+        device = self.images.device
         return torch.as_tensor(scenes.stack[:, None], device=device), torch.as_tensor(scenes.members, device=device)
 
     @cached_property
@@ -166,7 +142,7 @@ class FrameModel:
         shift = torch.as_tensor(self._shift[scenes.stack, scenes.reference], device=displacement.device)
         moved = (displacement[index] - shift.view(-1, 1, 1, 1, 2)).flatten(0, 1)
         weights = self.weights[index] * torch.as_tensor(scenes.contributes, device=displacement.device)
-        return GRIDS[self.scale].kernels_of_rows(moved, node_weights, weights.flatten(), self.frames.shape[-2])
+        return GRIDS[self.scale].kernels_of_rows(moved, node_weights, weights.flatten(), self.images.shape[-2])
 
     def places(self, scenes: Scenes) -> list[Tensor]:
         """Mean displacement (M, R, 2) of the rows of the frames of each scene."""
@@ -196,17 +172,17 @@ class FrameModel:
             chosen += [found] if found == number else []
             representative.append(found)
         # cross-validation of as many scenes at a time as the memory allows
-        scene_bytes = 4 * self.frames[0, 0].numel() * scenes.members.shape[1]
+        scene_bytes = 4 * self.images[0, 0].numel() * scenes.members.shape[1]
         strengths = np.ones(len(scenes.stack))
-        for part in runs(len(chosen), at_once(scene_bytes, self.frames.device, cpu_bytes=_FRAME_BYTES)):
+        for part in runs(len(chosen), at_once(scene_bytes, self.images.device, cpu_bytes=_FRAME_BYTES)):
             some = replace(take_stacks([scenes], np.array(chosen[part])), contributes=same[chosen[part]])
             stack_of, member_of = self._indices(some)
             strengths[chosen[part]] = prior_strengths(
-                self.frames[stack_of, member_of],
+                self.images[stack_of, member_of],
                 self._row_kernels(some),
                 self.prior.of(stack_of[:, 0], member_of),
                 self.level[stack_of].square(),
-                torch.from_numpy(self._blur_reaches(some)[:, None]).to(self.frames.device),
+                torch.from_numpy(self._blur_reaches(some)[:, None]).to(self.images.device),
                 certain=self.level_is_certain,
             )
         return strengths[representative]
@@ -228,14 +204,14 @@ class FrameModel:
     def problem(self, scenes: Scenes, kind: str, partition: Partition) -> SceneProblem:
         """The least-squares problem of scenes of one kind, with its missing values filled."""
         index = self._indices(scenes)
-        stack_of, width = index[0][:, 0], self.frames.shape[-1]
+        stack_of, width = index[0][:, 0], self.images.shape[-1]
 
         # Data with zero mean, rows extended to a period.
-        data = extend_rows(self.frames[index] - self.mean[stack_of][:, None], self.period)
+        data = extend_rows(self.images[index] - self.mean[stack_of][:, None], self.period)
 
         # Observation operator, and precision of the prior.
         kernels = self._row_kernels(scenes)
-        observation = GRIDS[self.scale](kernels, self.frames.shape[-2], self.period, data.dtype, len(data))
+        observation = GRIDS[self.scale](kernels, self.images.shape[-2], self.period, data.dtype, len(data))
         level = self.level[stack_of]
         if isinstance(self.prior, RowPrior):
             factors = np.stack([scenes.strength, self._blur_reaches(scenes)])[..., None]
@@ -262,17 +238,9 @@ class FrameModel:
         return with_missing_values(problem, measured, floor)
 
 
-def model_frames(
-    frames: Tensor,
-    motion: FrameMotion,
-    *,
-    noise: float | Literal["auto"] = "auto",
-    ignore: Tensor | None = None,
-    clipped: Tensor | None = None,
-    scale: int = 1,
-    strips: int = 1,
-) -> FrameModel:
-    """Noise levels, period and prior of the frames of B stacks; arguments as in ``restore_exact``."""
+def model_frames(given: MovingFrames, *, noise: float | Literal["auto"] = "auto", scale: int = 1) -> FrameModel:
+    """Noise levels, period and prior of frames; arguments as in ``restore_exact``."""
+    frames, motion, strips, ignore, clipped = given.images, given.motion, given.strips, given.ignore, given.clipped
     B, T, _, _, W = frames.shape
     unknown = ignore if clipped is None else clipped if ignore is None else ignore | clipped
 
@@ -299,8 +267,7 @@ def model_frames(
         of_stacks = ([stack] for stack in range(B))
         prior = [fit_polynomial_prior(frames[one], motion.of(one), levels[one], period) for one in of_stacks]
     return FrameModel(
-        frames=frames,
-        motion=motion,
+        **vars(given),
         weights=frame_weights * unit_variance[:, None],
         level=unit_variance.sqrt(),
         level_is_certain=noise != "auto" or T > 1,
@@ -309,16 +276,12 @@ def model_frames(
         period=period,
         scale=scale,
         unknown=unknown,
-        clipped=clipped,
-        strips=strips,
     )
 
 
-def solve_scenes(
-    model: FrameModel, scenes: Scenes, prior: Prior, regularisation: float, partition: Partition
-) -> tuple[Tensor, list[FrameDifference]]:
+def solve_scenes(model: FrameModel, scenes: Scenes, options: ExactOptions) -> tuple[Tensor, list[FrameDifference]]:
     """Images (N, C, S H, S W) of scenes, and, on the finer grid, the differences of the frames of each scene."""
-    frames, width = model.frames, model.frames.shape[-1]
+    width, partition = model.images.shape[-1], Partition(options.chunk_frequencies, options.segments)
     blocks = _blocks(model, scenes)
     found: dict[int, Tensor] = {}
     differences: list[FrameDifference] = []
@@ -330,24 +293,18 @@ def solve_scenes(
         some = take_stacks([scenes], np.array(numbers))
         problem = model.problem(some, kind, partition)
         if model.scale == 1:
-            deviations = prior.function(problem, regularisation)
+            deviations = PRIORS[options.prior].function(problem, options.regularisation)
         else:
             deviations, difference = finer_scene(problem, width, model.motion.neglected)
             differences.append(difference)
         found.update(zip(numbers, deviations[..., : model.scale * width] + model.mean[some.stack], strict=True))
         advance(len(numbers))
 
-    if torch.is_grad_enabled() and (frames.requires_grad or model.motion.exposures[0].requires_grad):
+    if torch.is_grad_enabled() and (model.images.requires_grad or model.motion.exposures[0].requires_grad):
         for block in blocks:
             solve(block)
     else:
-        threads = min(Partition.threads(frames.device), len(blocks))
-
-        def share(thread: int) -> None:
-            for block in blocks[thread::threads]:
-                solve(block)
-
-        in_parallel(share, range(threads), frames.device)
+        in_parallel(solve, blocks, model.images.device, at_most=MOST_THREADS)
     return torch.stack([found[number] for number in range(len(scenes.stack))]), differences
 
 
@@ -358,12 +315,12 @@ def _blocks(model: FrameModel, scenes: Scenes) -> list[tuple[str, list[int]]]:
     if model.scale != 1:
         return [(kind, [number]) for kind, numbers in of_kind.items() for number in numbers]
     # values of the systems and of the data of a scene
-    height, device = model.frames.shape[-2], model.frames.device
+    height, device = model.images.shape[-2], model.images.device
     frequencies, rows = model.period // 2 + 1, height + 2 * SCENE_REACH
     across = math.ceil(float(model.motion.blur_lengths[..., 1].max()))
     systems = rows * (2 * (TAPS - 1 + across) + 1) * frequencies
     most = Partition.most_values(rows, frequencies, device, blurred=False, single=False) // systems
-    scene_bytes = 4 * scenes.members.shape[1] * model.frames.shape[2] * height * model.period
+    scene_bytes = 4 * scenes.members.shape[1] * model.images.shape[2] * height * model.period
     most = max(1, min(most, at_once(scene_bytes, device, cpu_bytes=_FRAME_BYTES)))
     threads = Partition.threads(device)
     return [

@@ -9,8 +9,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from rsvib_torch.numerics.fourier import extend_rows, fast_length
+from rsvib_torch.numerics.fourier import extend_rows, extended_length, fast_length
 from rsvib_torch.restoration.exact.scene_solver import SceneProblem, SceneSolver
+from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.scene_model.observation import frequencies_of
 
 # px along the row from its middle; above, the boundary extension is filled: a larger blur mixes it into the frame
@@ -18,6 +19,17 @@ FILLED_BLUR_REACH = 1.0
 # px beyond four times the reach. With 64, frames behind exposures of 200 and 400 rows gain up to 0.03 dB with 3 px and
 # 0.3 dB with 8 px, and their extensions take 1.2 times as long
 _NEAR = 24
+
+
+def scene_period(motion: FrameMotion, width: int) -> int:
+    """Period in px of the scenes of all stacks with frames of ``width`` px."""
+    lengths = []
+    for bounds, blur in zip(motion.bounds, motion.blur_lengths[..., 0].max(1), strict=True):
+        margin = 8 + math.ceil(bounds[0] + 0.5)  # px beyond the displacement that influence the ends
+        # the boundary extension of blurred rows is filled; that of others is longer
+        filled = blur > 2 * FILLED_BLUR_REACH
+        lengths.append(fast_length(width + 2 * margin) if filled else extended_length(width, margin))
+    return max(lengths)
 
 
 def measured_values(along: Tensor, unknown: Tensor | None, shape: torch.Size, width: int, *, ends: bool) -> Tensor:

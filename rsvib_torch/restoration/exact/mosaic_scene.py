@@ -13,13 +13,12 @@ from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.mosaic import interpolated_colours, measures
 from rsvib_torch.numerics.fourier import extend_rows
 from rsvib_torch.options import ExactOptions
-from rsvib_torch.restoration.exact.exact import MIN_LEVEL, scene_period
-from rsvib_torch.restoration.exact.filling import measured_values
+from rsvib_torch.restoration.exact.filling import measured_values, scene_period
 from rsvib_torch.restoration.exact.finer_scene import phase_spread
 from rsvib_torch.restoration.exact.priors import check_prior
-from rsvib_torch.restoration.exact.scene_solver import Partition, SceneSolver
+from rsvib_torch.restoration.exact.scene_solver import MIN_LEVEL, Partition, SceneSolver
 from rsvib_torch.restoration.exact.similar_patches import similar_patches
-from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
+from rsvib_torch.restoration.frame_motion import FrameMotion, MovingFrames, joint_groups
 from rsvib_torch.restoration.noise import noise_levels
 from rsvib_torch.restoration.restoration_warning import warn_of_restoration
 from rsvib_torch.restoration.scene_model.finer_grid import SCALE, FinerObservation, fit_polynomial_prior
@@ -122,15 +121,7 @@ class MosaicSolver:
         return _colours(self._observation.image(coefficients[:, :, None]))[0]
 
 
-def restore_mosaic(
-    frames: Tensor,
-    motion: FrameMotion,
-    options: ExactOptions,
-    *,
-    colours: Tensor,
-    ignore: Tensor | None = None,
-    clipped: Tensor | None = None,
-) -> Tensor:
+def restore_mosaic(given: MovingFrames, colours: Tensor, options: ExactOptions) -> Tensor:
     """Colour images (B, groups, 3, scale H, scale W) from mosaics: all frames of a group and all colours together.
 
     The scene is unknown on a grid of half pixels, and each pixel measures one of its colours. Luminance and two colour
@@ -138,17 +129,14 @@ def restore_mosaic(
     predicted from the restored scene. ``similar_patches`` removes noise from it, and interpolates the colours of each
     frame where the frames do not determine them, as with one frame.
 
-    Arguments as above ``METHODS``; ``colours`` (B, T, 1, H, W) is the colour that each pixel measures, 0 to 2.
-    ``noise="auto"`` is estimated from the residual of the frames of a group; that of one frame is too low rather than
-    too high.
+    ``colours`` are those of the frames. ``noise="auto"`` is estimated from the residual of the frames of a group; that
+    of one frame is too low rather than too high.
     """
     # 1. Check the options, and list the frames of each result.
+    frames, motion, ignore, clipped = given.images, given.motion, given.ignore, given.clipped
     height, width = frames.shape[-2:]
-    factor, scale = options.regularisation, options.scale
-    check_prior(options.prior, scale=scale, mosaic=True)
+    check_prior(options.prior, scale=options.scale, mosaic=True)
     groups = joint_groups(frames.shape[1], options.joint)
-    partition = Partition(options.chunk_frequencies, options.segments)
-    stated = None if options.noise == "auto" else max(options.noise, MIN_LEVEL)
     # 2. The displacement of each row during its exposure, and the period that it requires.
     displacement, node_weights = motion.exposures
     length = scene_period(motion, width)
@@ -161,10 +149,10 @@ def restore_mosaic(
         floor = None if clipped is None else torch.where(measured & clipped[stack], mosaic, -torch.inf)
         if ignore is not None:
             measured = measured & ~ignore[stack]
-        if stated is None:  # of colours whose noise was halved by interpolation
+        if options.noise == "auto":  # of colours whose noise was halved by interpolation
             level = 2 * noise_levels(linear.detach()[None], motion.of([stack])).square().mean().sqrt()
         else:
-            level = torch.as_tensor(stated, dtype=frames.dtype, device=frames.device)
+            level = torch.as_tensor(max(options.noise, MIN_LEVEL), dtype=frames.dtype, device=frames.device)
         # 4. The scene of each group of frames; its colours are interpolated first if the frames do not determine them.
         for members, reference in groups:
             shift = motion.shift[stack, members] - motion.shift[stack, reference]
@@ -181,7 +169,7 @@ def restore_mosaic(
                 part = part.demosaiced(mosaic[members], measures(colours[stack][:1])[0])
             kernels = FinerObservation.kernels_of_rows(moved, node_weights, frames.new_ones(len(members)), height)
             observation = FinerObservation(kernels, height, length, frames.dtype)
-            images.append(part.restored(observation, shift[:, 0], stated is None, factor, partition, scale))
+            images.append(part.restored(observation, shift[:, 0], options))
             advance()
     return torch.stack(images).unflatten(0, (-1, len(groups)))
 
@@ -206,15 +194,7 @@ class _Frames:
         images = similar_patches(self.images, values, pattern, self.level, rounds=8, steps=6)
         return replace(self, images=images, measured=torch.ones_like(self.measured), floor=None, level=self.level / 2)
 
-    def restored(
-        self,
-        observation: FinerObservation,
-        along: Tensor,
-        unknown_level: bool,
-        regularisation: float,
-        partition: Partition,
-        scale: int,
-    ) -> Tensor:
+    def restored(self, observation: FinerObservation, along: Tensor, options: ExactOptions) -> Tensor:
         """Colours (3, scale H, scale W) of the scene.
 
         ``along`` (M,) are px by which the frames are moved along the rows relative to the restored one. An unknown
@@ -222,6 +202,7 @@ class _Frames:
         """
         # 1. Deviations from the mean, extended to the period, and the weights of the measured and of the filled values.
         count, width, level = len(self.images), self.images.shape[-1], self.level
+        scale, partition = options.scale, Partition(options.chunk_frequencies, options.segments)
         mean = self.images.mean((0, 2, 3))[:, None, None]
         data = extend_rows(self.images - mean, self.length)
         inside = measured_values(along[None], None, data[None].shape, width, ends=True)[0]
@@ -237,7 +218,7 @@ class _Frames:
         # 2. Fit twice, with priors fitted to predicted instead of interpolated colours: 1 to 3 dB for eight frames. The
         # interpolated ones lack detail, so that their prior is too strong: 0.01 instead of 1 gains 2 to 3 dB for eight
         # frames, 1.4 dB for two, 0.1 dB for one (noise 0.002; 0.0 dB at noise 0.01).
-        first = solver(0.01 * regularisation)
+        first = solver(0.01 * options.regularisation)
         coefficients = first.fit(data, iterations=12)
         gain = None
         with torch.no_grad():
@@ -245,7 +226,7 @@ class _Frames:
             full = torch.where(self.measured, full, predicted[..., :width] + mean)
             if count > 1:
                 residual_level, gain = _residual_level(first, data - predicted, measured)
-                if unknown_level:
+                if options.noise == "auto":
                     level = residual_level
                 elif bool(residual_level > 1.5 * level):
                     warn_of_restoration(
@@ -255,7 +236,7 @@ class _Frames:
                     )
             if self.floor is not None:  # saturated values are lower bounds: only those above the prediction count
                 measured[..., :width] &= (predicted[..., :width] + mean <= self.floor) | self.floor.isinf()
-        second = solver(regularisation)
+        second = solver(options.regularisation)
         scene = second.image(second.fit(data, coefficients, iterations=20)) + mean
         scene = scene[:, :: SCALE // scale, : SCALE * width : SCALE // scale]
         if gain is None:

@@ -30,6 +30,9 @@ from rsvib_torch.numerics.banded_solver import (
 )
 from rsvib_torch.restoration.scene_model.observation import Observation
 
+MOST_THREADS = 2  # that solve systems side by side; more wait for each other's calls from Python
+MIN_LEVEL = 1e-5  # of full scale, lowest noise level assumed; below, the systems lose digits in single precision
+
 
 def row_windows(rows: int, count: int, overlap: int = 96) -> list[slice]:
     """Windows of one size that cover all rows, neighbours overlapping by at least twice ``overlap`` rows.
@@ -63,8 +66,8 @@ class Partition:
 
     @staticmethod
     def threads(device: torch.device) -> int:
-        """Chunks that are solved side by side; more than two threads wait for each other's calls from Python."""
-        return min(allowed_threads(), 2) if device.type == "cpu" else 1
+        """Chunks that are solved side by side."""
+        return min(allowed_threads(), MOST_THREADS) if device.type == "cpu" else 1
 
     @staticmethod
     def most_values(rows: int, frequencies: int, device: torch.device, *, blurred: bool, single: bool) -> int:
@@ -199,13 +202,11 @@ class SceneSolver:
             return torch.cat([solve(number) for number in range(len(self.parts))], dim=-1)
         channels = given.shape[-3 if given.ndim == 5 else 1]
         coefficients: Tensor = given.new_empty(self.observation.count, channels, scenes, len(self.u))
-        threads = min(Partition.threads(given.device), len(self.parts))
 
-        def share(thread: int) -> None:
-            for number in range(thread, len(self.parts), threads):
-                coefficients[..., self.parts[number]] = solve(number)
+        def fill_part(number: int) -> None:
+            coefficients[..., self.parts[number]] = solve(number)
 
-        in_parallel(share, range(threads), given.device)
+        in_parallel(fill_part, range(len(self.parts)), given.device, at_most=MOST_THREADS)
         return coefficients
 
     def predict(self, coefficients: Tensor) -> Tensor:

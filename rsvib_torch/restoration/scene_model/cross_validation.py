@@ -10,21 +10,11 @@ from torch import Tensor
 
 from rsvib_torch.numerics.banded_solver import factor_banded
 from rsvib_torch.numerics.fourier import squared_modulus, waves
-from rsvib_torch.numerics.tables import table, tables
+from rsvib_torch.numerics.tables import Array, table, tables
 from rsvib_torch.restoration.scene_model.observation import Observation, RowKernels
 from rsvib_torch.restoration.scene_model.scene_prior import RowPrior
 
 _SLAB_ROWS = 128  # rows solved side by side, each slab by itself: enough for the dependence on distant rows to vanish
-
-
-@dataclass(frozen=True, eq=False)
-class Explained:
-    """Residuals of fits with n priors to S scenes, frequency by frequency."""
-
-    # (n, S, F) squared residuals of all rows, mean over channels, in units of the noise of one pixel
-    power: NDArray[np.float64]
-    freedom: NDArray[np.float64]  # (n, S, F) degrees of freedom of the fit
-    count: NDArray[np.float64]  # (S,) rows with a weight above 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +25,13 @@ class SampledRows:
     spectra: Tensor  # (S n, M, C, R, F), the phase of each row's middle taken off
     energy: float  # squared norm of the taper, times the number of channels; powers are divided by it
 
-    def explain(self, precisions: Tensor) -> Explained:
-        """Fit the scenes with each of n priors, products (n, p + 1, p + 1, S, F) as from ``RowPrior.precision``."""
+    def unexplained(self, precisions: Tensor) -> tuple[Array, Array]:
+        """Residuals of fits to the scenes with each of n priors, frequency by frequency.
+
+        The priors are products (n, p + 1, p + 1, S, F) as from ``RowPrior.precision``. The results (n, S, F) are the
+        squared residuals of all rows, mean over channels, in units of the noise of one pixel; and the number of rows of
+        a weight above 0, less the degrees of freedom of the fit.
+        """
         observation, spectra = self.observation, self.spectra
         number, scenes, frequencies = len(precisions), precisions.shape[-2], precisions.shape[-1]
         slabs, members = observation.num_scenes // scenes, spectra.shape[1]
@@ -59,7 +54,8 @@ class SampledRows:
         residual = squared_modulus(spectra[:, :, :, None] - predicted)
         power = torch.einsum("smr,smcnrf->nsf", weight.to(residual.dtype), residual) / self.energy
         counted = (weight > 0).double().sum((1, 2)).view(scenes, slabs).sum(1)
-        return Explained(*tables(power.unflatten(1, (scenes, slabs)).sum(2), freedom, counted))
+        of_scenes, rest = tables(power.unflatten(1, (scenes, slabs)).sum(2), counted[:, None] - freedom)
+        return of_scenes, rest
 
 
 @torch.no_grad()
@@ -141,11 +137,10 @@ def prior_strengths(
         # from all others. The sum over the frequencies is dominated by those with the largest errors; the geometric
         # mean gives all the same weight. The weaker of the two selected priors is used, as it has the smaller error.
         precisions = [at.precision(noise_power, strength, blur_reach) for strength in _STRENGTHS[:tried].tolist()]
-        explained = sample.explain(torch.stack(precisions))
-        rest = explained.count[:, None] - explained.freedom
+        power, rest = sample.unexplained(torch.stack(precisions))
         with np.errstate(divide="ignore", invalid="ignore"):
-            of_sum = np.log(explained.power.sum(-1)) - 2 * np.log(rest.sum(-1))
-            geometric = (np.log(explained.power) - 2 * np.log(rest)).mean(-1)
+            of_sum = np.log(power.sum(-1)) - 2 * np.log(rest.sum(-1))
+            geometric = (np.log(power) - 2 * np.log(rest)).mean(-1)
         criteria = (np.where(allowed[:tried], values + handicap[:tried], np.inf) for values in (of_sum, geometric))
         selected = np.maximum(*(criterion.argmin(0) for criterion in criteria))
     return _STRENGTHS[selected]

@@ -273,7 +273,7 @@ def _judged_strip(frames: ComparedFrames) -> ComparedFrames:
 
     With roll or zoom, this is a strip of columns: of those in the middle of both halves, the one with more detail.
     """
-    raw, motion, width = frames.raw, frames.motion, frames.raw.shape[-1]
+    raw, motion, width = frames.images, frames.motion, frames.images.shape[-1]
     if motion.vibration.same_for_all_columns:
         motion.check_fits(width)
         return frames
@@ -285,12 +285,8 @@ def _judged_strip(frames: ComparedFrames) -> ComparedFrames:
     columns = torch.tensor(middles, dtype=torch.float64, device=raw.device)
     starts, height = tuple(motion.frame_starts.tolist()), motion.num_rows
     of_strips = ColumnMotion(motion.vibration, columns, starts, motion.timing.row_time, height)
-    return ComparedFrames(
-        cut_columns(raw, parts),
-        cut_columns(frames.restored, parts),
-        None if frames.ignore is None else cut_columns(frames.ignore, parts),
-        frame_motion(of_strips, motion.timing, motion.frame_starts, height),
-    )
+    of_frames = frame_motion(of_strips, motion.timing, motion.frame_starts, height)
+    return frames.mapped(lambda values: cut_columns(values, parts), motion=of_frames)
 
 
 def judge_prepared(
@@ -329,13 +325,13 @@ def judge_stacks(
     limit = None if most_pairs is None else check_whole_number("most_pairs", most_pairs, at_least=1)
     dtype = torch.promote_types(frames.images.dtype, restored.dtype)
     raw, still = (images.to(dtype) for images in frames.compared(restored))
-    every = ComparedFrames(raw, still, frames.missing, motion)
+    every = ComparedFrames(images=raw, restored=still, ignore=frames.missing, motion=motion)
     count = raw.shape[1]
     pairs = pairs_to_judge(count, joint, limit)
     # only the frames that are compared, if these are some of a long stack
     numbers = sorted({frame for pair in pairs for frame in pair})
     if len(numbers) < count:
-        every = every.of(list(range(len(raw))), numbers)
+        every = every.of_stacks(list(range(len(raw))), numbers)
     compared = [(numbers.index(earlier), numbers.index(later)) for earlier, later in pairs]
     shared = len(joint_groups(count, joint)[0][0])  # frames from which one image is restored
     advance = steps(len(moves), "stacks")
@@ -345,7 +341,7 @@ def judge_stacks(
     together = at_once(16 * pixels, raw.device, cpu_bytes=2**26)
     verdicts: list[RestorationVerdict | TooLittleInCommonError] = []
     for chosen in (list(moves)[part] for part in runs(len(moves), together)):
-        some = every if len(chosen) == len(raw) else every.of(chosen)  # all are judged without a copy
+        some = every if len(chosen) == len(raw) else every.of_stacks(chosen)  # all are judged without a copy
         moving = [moves[stack] for stack in chosen]
         verdicts += _judge_batch(_judged_strip(some), moving, compared, numbers, shared, columns, frames.image_timing)
         advance(len(chosen))
@@ -368,13 +364,13 @@ def _judge_batch(
     """
     # What the frames of each pair have in common. Stacks with too little are not judged; stacks whose parts of one size
     # would be too small are judged one by one.
-    size = frames.raw.shape[-2:]
+    size = frames.images.shape[-2:]
     steps, rims = overlaps(frames, pairs)
     if not is_enough(size, abs(steps).max(0), rims.max(0)).all():
         results: list[RestorationVerdict | TooLittleInCommonError] = []
         for stack, enough in enumerate(is_enough(size, steps, rims)):
             if enough.all():
-                alone = frames.of([stack])
+                alone = frames.of_stacks([stack])
                 results += _judge_batch(alone, [moves[stack]], pairs, numbers, shared, columns, timing)
                 continue
             place = int(enough.argmin())
@@ -395,7 +391,9 @@ def _judge_batch(
     displacements = np.stack([displacements for _, displacements, _ in verdicts], -2)  # (3, B, P, 2)
     if timing.scan_axis == -1:
         displacements = displacements[..., ::-1].copy()
-    of_levels, of_displacements = (torch.from_numpy(values).to(frames.raw.device) for values in (levels, displacements))
+    of_levels, of_displacements = (
+        torch.from_numpy(values).to(frames.images.device) for values in (levels, displacements)
+    )
     return [
         RestorationVerdict(
             **dict(zip(LEVELS, of_levels[:, stack], strict=True)),

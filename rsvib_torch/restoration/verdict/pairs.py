@@ -21,7 +21,7 @@ from rsvib_torch.imaging.blur import form_rows
 from rsvib_torch.numerics.fourier import extended_length, spline_spectra
 from rsvib_torch.numerics.splines import correlated
 from rsvib_torch.numerics.tables import Array, table, tables
-from rsvib_torch.restoration.frame_motion import FrameMotion
+from rsvib_torch.restoration.frame_motion import FrameMotion, MovingFrames
 
 _SMOOTHING = 5.0  # px, standard deviation of the Gaussian in ``misfit``; displacements of up to about 10 px stay linear
 _RIM = math.ceil(3 * _SMOOTHING) + 1  # px; half width of the kernels of ``misfit``
@@ -32,24 +32,20 @@ class TooLittleInCommonError(ValueError):
     """Two frames share too little of the scene to be compared."""
 
 
-@dataclass(frozen=True, eq=False)
-class ComparedFrames:
-    """Frames of B stacks, raw and restored, in row order."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ComparedFrames(MovingFrames):
+    """Raw frames of B stacks, and the frames restored from them."""
 
-    raw: Tensor  # (B, T, C, H, W)
-    restored: Tensor  # likewise, or (B, 1, C, H, W) in the coordinates of the earlier frame of each pair
-    ignore: Tensor | None  # bool tensor shaped like the raw frames, pixels without data; None for none
-    motion: FrameMotion  # motion of the raw frames
+    restored: Tensor  # like the images, or (B, 1, C, H, W) in the coordinates of the earlier frame of each pair
 
-    def of(self, stacks: list[int], frames: list[int] | None = None) -> "ComparedFrames":
+    def of_stacks(self, stacks: list[int], frames: list[int] | None = None) -> "ComparedFrames":
         """Some of the stacks, and some of their frames; None for all."""
-        members = slice(None) if frames is None else frames
-        return ComparedFrames(
-            self.raw[stacks][:, members],
-            self.restored[stacks] if self.restored.shape[1] == 1 else self.restored[stacks][:, members],
-            None if self.ignore is None else self.ignore[stacks][:, members],
-            self.motion.of(stacks, frames),
-        )
+        count, members = self.images.shape[1], slice(None) if frames is None else frames
+
+        def chosen(values: Tensor) -> Tensor:
+            return values[stacks] if values.shape[1] < count else values[stacks][:, members]
+
+        return self.mapped(chosen, motion=self.motion.of(stacks, frames))
 
     @cached_property
     def moved(self) -> Tensor:
@@ -110,7 +106,7 @@ def shared_part(
     Steps and rims (B, 2) of the pair are from ``overlaps``. Of the columns, those with the most detail are kept; None
     for all.
     """
-    raw, restored, ignore, motion, moved = frames.raw, frames.restored, frames.ignore, frames.motion, frames.moved
+    raw, restored, ignore, motion, moved = frames.images, frames.restored, frames.ignore, frames.motion, frames.moved
     earlier, later = pair
     # the largest displacement of all stacks determines the size of the part
     height, width = (np.array(raw.shape[-2:]) - abs(steps).max(0)).tolist()
