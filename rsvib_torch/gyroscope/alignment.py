@@ -236,17 +236,15 @@ def align_motion(
     if isinstance(recorded, AngularRates):
         images = frames_from_row_order(grey[0], timing)
         masks = [None] * len(images) if stack.valid is None else frames_from_row_order(stack.valid[0], timing)
-        starts = timing.in_row_order().frame_starts(len(images)).cpu()
+        starts = timing.in_row_order().frame_starts(len(images)).tolist()
         return align_rates(
-            corner_tracks(zip(range(len(images)), images, masks, strict=True), starts.tolist(), timing),
-            torch.stack([starts[:-1], starts[1:]], -1),
-            grey.shape[2:],
+            corner_tracks(zip(range(len(images)), images, masks, strict=True), starts, timing),
             timing,
             recorded,
             options.camera,
             offsets=options.offsets,
             fit_scale=options.fit_scale,
-            fit_focal_length=options.camera is None or options.fit_gain,
+            fit_gain=options.fit_gain,
             fit_row_time=options.fit_row_time,
         )
     bands = options.bands()

@@ -139,9 +139,7 @@ class VideoPasses:
         for _ in pairs():  # for ``compared``, and for ``checked``
             pass
         tracks = tracks_of_pairs(compared, self.starts, timing, self.frames.size)
-        starts = tensor(np.array([self.starts[index : index + 2] for index in compared]))
-        size, fitted = self.frames.size if timing.scan_axis == -2 else self.frames.size[::-1], self.camera is None
-        found = align_rates(tracks, starts, size, timing, self.rates, self.camera, fit_focal_length=fitted)
+        found = align_rates(tracks, timing, self.rates, self.camera)
         if not found.reliable:
             raise ValueError(f"the gyroscope ({self.rates.source}) does not fit the video: {'; '.join(found.reasons)}")
         rotation = RecordedRotation.aligned(self.rates, found, taken)
