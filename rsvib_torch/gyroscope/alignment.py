@@ -6,14 +6,14 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, ParamSpec, Protocol, overload
+from typing import Any, ParamSpec, Protocol, overload
 
 import numpy as np
 import torch
 from pydantic import Field
 from torch import Tensor
 
-from rsvib_torch.checks.validation import Extensible, Number
+from rsvib_torch.checks.validation import Number
 from rsvib_torch.checks.validation import options as option_group
 from rsvib_torch.checks.values import check_single
 from rsvib_torch.detection.measurements import Measurements
@@ -39,7 +39,7 @@ from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array, table, tensor
-from rsvib_torch.options import BandOptions, MaskedInputOptions, Registration, RegistrationOptions
+from rsvib_torch.options import OffsetOptions
 from rsvib_torch.results.presentation import JudgedResult
 from rsvib_torch.results.reason import Reason
 from rsvib_torch.text import measured_text, wrapped
@@ -119,12 +119,9 @@ class FittedClock:
 
 
 @option_group
-class AlignOptions(BandOptions, MaskedInputOptions):
+class AlignOptions(OffsetOptions):
     """Options of ``align_motion``; bands are those of the start, and not used for angular rates."""
 
-    registration: Annotated[Registration, Extensible] | None = Field(
-        default=None, description='Method of the bands, for a motion; by default "ncc".'
-    )
     camera: Camera | None = Field(
         default=None, description="Focal length and lens, for angular rates; by default the focal length is fitted."
     )
@@ -144,15 +141,6 @@ class AlignOptions(BandOptions, MaskedInputOptions):
         default=False,
         description="Whether to fit the row time as well, with angular rates; ``timing`` has the start value.",
     )
-
-    def bands(self) -> RegistrationOptions:
-        """The row bands."""
-        return RegistrationOptions(
-            registration=self.registration or "ncc",
-            band_rows=self.band_rows,
-            band_step=self.band_step,
-            search=self.search,
-        )
 
 
 class _AlignsMotion(Protocol[P]):
@@ -247,11 +235,10 @@ def align_motion(
             fit_gain=options.fit_gain,
             fit_row_time=options.fit_row_time,
         )
-    bands = options.bands()
-    rowwise, curve, (first, last) = start_curve(stack, timing, bands)
+    rowwise, curve, (first, last) = start_curve(stack, timing, options)
     turned = recorded.to_row_order(timing).to("cpu")
     low, high = offset_range(turned.start, turned.end, first, last, options.offsets)
-    measured = measurements_of_curve(curve, rowwise, bands.band_step)
+    measured = measurements_of_curve(curve, rowwise, options.band_step)
     offset, other = best_offset(measured, turned, low, high, rowwise)
     clock = FittedClock(offset + 0.5 * (first + last), 1.0, (1.0, 1.0), (0.0, 0.0), 0.5 * (first + last))
     clock, _ = fit_clock(measured, turned, clock, False, options.fit_gain)

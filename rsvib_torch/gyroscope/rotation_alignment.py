@@ -10,14 +10,7 @@ from rsvib_torch.checks.values import check_number
 from rsvib_torch.detection.verdict import recording_reasons
 from rsvib_torch.gyroscope.corner_tracks import CornerTracks
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, orientation_matrix
-from rsvib_torch.gyroscope.rotation_fit import (
-    NAMES,
-    RotationFit,
-    RotationModel,
-    components_of,
-    fit_robustly,
-    image_components,
-)
+from rsvib_torch.gyroscope.rotation_fit import RotationFit, RotationModel, fit_robustly, image_components
 from rsvib_torch.gyroscope.rotation_search import Start, search_orientations
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.spline import FreeMotion
@@ -240,14 +233,13 @@ def _result(
 ) -> RotationAlignment:
     """The result of a fit to frames whose readout has a number of rows; an ``other`` offset in s explains them too."""
     model, radius, starts = fit.model, fit.model.tracks.radius, fit.model.tracks.starts
-    values = dict(zip(NAMES, fit.parameters.tolist(), strict=True))
+    *_, at, scale, focal_length, row_time = fit.parameters.tolist()
     std = fit.covariance.diagonal().clamp(min=0.0).sqrt()
-    at, scale, focal_length, row_time = (values[name] for name in ("at", "scale", "focal length", "row time"))
     gradient = torch.zeros(7, dtype=torch.float64)
     gradient[3], gradient[4] = 1.0, -model.middle  # offset = at - scale * middle
     offset, offset_std = at - scale * model.middle, float(gradient @ fit.covariance @ gradient) ** 0.5
     middles = starts + 0.5 * (rows - 1) * row_time + 0.5 * model.tracks.exposure_time
-    predicted = components_of(model.rates, model.orientation, fit.parameters, middles, model.middle)
+    predicted = model.components(fit.parameters, middles)
     units = torch.tensor([1.0, 1.0, 1 / radius], dtype=torch.float64)
     unexplained = fit.errors.effects[:3] * units
     first, last = float(middles[0, 0]) - 0.5 * rows * row_time, float(middles[-1, 1]) + 0.5 * rows * row_time

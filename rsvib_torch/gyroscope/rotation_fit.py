@@ -46,14 +46,7 @@ _DRAWS = 16
 _LEAST_STD = 1e-3  # px, of corners and of effects; below every error
 
 
-def components_of(rates: AngularRates, orientation: str, parameters: Tensor, times: Tensor, middle: float) -> Tensor:
-    """(M, 3) X and Y in px and theta in rad between two times (M, 2) in s on the clock of the frames."""
-    first, last = (parameters[3] + parameters[4] * (times - middle)).unbind(-1)
-    turned = rates.rotation(first, last) - (last - first)[:, None] * parameters[:3]
-    return image_components(turned @ orientation_matrix(orientation).T, parameters[5])
-
-
-def image_components(turned: Tensor, focal_length: Tensor) -> Tensor:
+def image_components(turned: Tensor, focal_length: Tensor | float) -> Tensor:
     """X and Y in px and theta in rad of rotation vectors (..., 3) of a camera."""
     pitch, yaw, roll = turned.unbind(-1)
     return torch.stack([-focal_length * yaw, focal_length * pitch, -roll], -1)
@@ -70,6 +63,12 @@ class RotationModel:
     middle: float  # s, mid-time of the frames
     free: tuple[bool, ...]  # (7,) whether parameters are fitted
 
+    def components(self, parameters: Tensor, times: Tensor) -> Tensor:
+        """(M, 3) X and Y in px and theta in rad between two times (M, 2) in s on the clock of the frames."""
+        first, last = (parameters[3] + parameters[4] * (times - self.middle)).unbind(-1)
+        turned = self.rates.rotation(first, last) - (last - first)[:, None] * parameters[:3]
+        return image_components(turned @ orientation_matrix(self.orientation).T, parameters[5])
+
     def predicted(self, parameters: Tensor) -> Tensor:
         """Displacements (M, 2) in px by the rotation, for parameters (7,) in the order of ``NAMES``."""
         nodes, weights = gauss_legendre(2)  # exact for a motion of third order within an exposure
@@ -78,8 +77,7 @@ class RotationModel:
 
     def _displaced(self, parameters: Tensor, node: float) -> Tensor:
         """Displacements (M, 2) in px at a place 0 ... 1 within the exposures."""
-        times = self.tracks.times(float(parameters[6]), node)
-        components = components_of(self.rates, self.orientation, parameters, times, self.middle)
+        components = self.components(parameters, self.tracks.times(float(parameters[6]), node))
         camera = replace(self.camera, focal_length=float(parameters[5]))
         return camera.displacement_of_rays(components, *camera.rays(*self.tracks.place.unbind(-1)))
 
@@ -315,14 +313,13 @@ def fit_robustly(model: RotationModel, start: Tensor) -> RotationFit:
     tracks = model.tracks
     residual = tracks.offsets - model.predicted(start)
     follows = _following(tracks, tracks.offsets - residual).double()
-    none = torch.zeros(len(tracks.starts), 6, dtype=torch.float64)
-    errors = Errors(follows, torch.ones_like(follows), 1.0, 1.0, none[0], 1.0)
-    fit = RotationFit(model, start, torch.zeros(7, 7).double(), none[0, :3], none, errors, 0.0)
     # 1. Without a translation.
+    none = torch.zeros(len(tracks.starts), 6, dtype=torch.float64)
     sigma = max(1.4826 * float(residual[follows > 0].abs().median()), _LEAST_STD)
     spread = torch.tensor([_START_ROTATION] * 3 + [_LEAST_STD] * 3, dtype=torch.float64)
-    errors = replace(errors, sigma=sigma, depth=0.0, effects=spread, mean_translation=_LEAST_STD)
-    still = _weighted(replace(fit, errors=errors), follows)
+    errors = Errors(follows, torch.ones_like(follows), sigma, 0.0, spread, _LEAST_STD)
+    fit = RotationFit(model, start, torch.zeros(7, 7).double(), none[0, :3], none, errors, 0.0)
+    still = _weighted(fit, follows)
     # 2. With one, from its direction with the least median of the displacements across its lines.
     sampled = (follows > 0).nonzero()[:, 0]
     sampled = sampled[:: max(1, len(sampled) // 2000)]
