@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from gpmf_file import write_rates
 from program import refused, rsvib
 from refusals import refuses
 from rotating_camera import BIAS, COUNT, FOCAL_LENGTH, OFFSET, TIMING, attitude, in_axes, rates_of, recorded, take
@@ -164,12 +165,6 @@ def test_command_estimates_clock_and_row_time(frames, tmp_path, capsys):
     assert "give one of them" in refused(capsys, *arguments, *both)
     alone = ("--offset", 0.35, "--overwrite")
     assert "axes and clock of a gyroscope are estimated from the frames" in refused(capsys, *arguments, *alone)
-
-
-def write_rates(path, rates):
-    rows = torch.cat([rates.times[:, None], rates.rates], 1).tolist()
-    text = "\n".join(",".join(f"{value:.12g}" for value in row) for row in rows)
-    path.write_text(f"time,gx_rad_s,gy_rad_s,gz_rad_s\n{text}")
 
 
 def test_rows_that_do_not_count(tmp_path, capsys):
