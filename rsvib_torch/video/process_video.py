@@ -259,8 +259,9 @@ class _SecondPass:
                 first = list(islice(tracked, _JUDGED_FRAMES))
                 verdict = video.verdict(motion, first)
                 # Parallax and overlays make two frames worse that shake less: corners decide.
-                is_doubted = not video.is_explained(motion, part) or (verdict and verdict.overall == "worse")
-                is_worse = bool(is_doubted) and video.shakes_more(motion, [track for track, _ in first])
+                contradicts = verdict is not None and verdict.overall == "worse"
+                is_doubted = contradicts or not video.is_explained(motion, part)
+                is_worse = is_doubted and video.shakes_more(motion, [track for track, _ in first])
                 self.verdicts[part] = None if is_doubted and not is_worse else verdict
                 for track, frame in chain(first, tracked):
                     yield video.left_alone(track) if is_worse else track, frame

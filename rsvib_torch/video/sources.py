@@ -134,12 +134,9 @@ class PipeSource:
         channels = 3 if self._format in ("rgb24", "bgr24") else 1
         count, index = height * width * channels * dtype.itemsize, 0
         while len(data := self._stream.read(count)) == count:
-            pixels = np.frombuffer(data, dtype)
-            if channels == 1:
-                pixels = pixels.reshape(height, width)
-            else:
-                colours = pixels.reshape(height, width, 3)
-                pixels = _channels_first(colours[..., ::-1] if self._format == "bgr24" else colours)
+            pixels = np.frombuffer(data, dtype).reshape(height, width, channels)
+            pixels = pixels[..., ::-1] if self._format == "bgr24" else pixels
+            pixels = _channels_first(pixels) if channels == 3 else pixels[..., 0]
             yield TimedFrame(pixels, index * self._period, time.perf_counter())
             index += 1
 
