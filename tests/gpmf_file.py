@@ -1,4 +1,4 @@
-"""Videos with a GPMF track, written byte by byte: a writer that shares nothing with the reader."""
+"""Files of gyroscopes: CSV, and videos with a GPMF track by a writer that shares nothing with the reader."""
 
 import struct
 
@@ -6,6 +6,12 @@ import numpy as np
 
 TIMES = np.arange(60) / 200.0
 RATES = np.round(np.stack([0.5 * np.sin(20 * TIMES), -0.3 * np.cos(9 * TIMES), 0.1 + 0.4 * TIMES], -1), 3)
+
+
+def write_rates(path, rates):
+    """A CSV file of ``AngularRates``."""
+    rows = np.column_stack([rates.times, rates.rates])
+    np.savetxt(path, rows, "%.12g", ",", header="time_s,gx_rad_s,gy_rad_s,gz_rad_s", comments="")
 
 
 def box(kind, *contents):
@@ -17,7 +23,7 @@ def entry(key, kind, size, count, content):
     return key + kind + struct.pack(">BH", size, count) + content + b"\0" * (-len(content) % 4)
 
 
-def packet(rates, *, total, scale=1000, orientation=b"", stamp=None, first=None, turned=None, exposures=None):
+def packet(rates, *, total, orientation=b"", stamp=None, first=None, turned=None, exposures=None):
     accelerations = entry(b"ACCL", b"s", 6, 1, struct.pack(">hhh", 1, 2, 3))
     if first is not None:
         accelerations = entry(b"STMP", b"J", 8, 1, struct.pack(">Q", first)) + accelerations
@@ -32,10 +38,10 @@ def packet(rates, *, total, scale=1000, orientation=b"", stamp=None, first=None,
     parts = [entry(b"TSMP", b"L", 4, 1, struct.pack(">I", total))]
     if stamp is not None:
         parts.append(entry(b"STMP", b"J", 8, 1, struct.pack(">Q", stamp)))
-    parts.append(entry(b"SCAL", b"s", 2, 1, struct.pack(">h", scale)))
+    parts.append(entry(b"SCAL", b"s", 2, 1, struct.pack(">h", 1000)))
     if orientation:
         parts.append(entry(b"ORIN", b"c", 1, 3, orientation))
-    raw = np.round(np.asarray(rates) * scale).astype(">i2").tobytes()
+    raw = np.round(np.asarray(rates) * 1000).astype(">i2").tobytes()
     parts.append(entry(b"GYRO", b"s", 6, len(rates), raw))
     other = entry(b"STRM", b"\0", 1, len(accelerations), accelerations)
     own = b"".join(parts)
@@ -63,25 +69,24 @@ def _places(packets, place):
     return [place + sum(map(len, packets[:number])) for number in range(len(packets))]
 
 
-def _track(packets, places, *, duration=300, timescale=1000, kind=b"gpmd", count=None):
-    number = len(packets) if count is None else count
+def _track(packets, places, *, duration=300, kind=b"gpmd"):
+    number = len(packets)
     table = box(
         b"stbl",
         box(b"stsd", struct.pack(">II", 0, 1), struct.pack(">I4s", 16, kind), b"\0" * 8),
         box(b"stts", struct.pack(">IIII", 0, 1, number, duration)),
         box(b"stsc", struct.pack(">IIIII", 0, 1, 1, 1, 1)),
         box(b"stsz", struct.pack(">III", 0, 0, number), *(struct.pack(">I", len(data)) for data in packets)),
-        box(b"stco", struct.pack(">II", 0, len(packets)), *(struct.pack(">I", at) for at in places)),
+        box(b"stco", struct.pack(">II", 0, number), *(struct.pack(">I", at) for at in places)),
     )
-    header = box(b"mdhd", struct.pack(">IIIII", 0, 0, 0, timescale, 0), b"\0" * 4)
+    header = box(b"mdhd", struct.pack(">IIIII", 0, 0, 0, 1000, 0), b"\0" * 4)
     return box(b"trak", box(b"mdia", header, box(b"minf", table)))
 
 
-def packets_of(size=20, **options):
-    """Packets of the rates, at 200 Hz; ``stamp`` and ``first`` are times of it and of another sensor."""
+def packets_of(**options):
+    """Packets of 20 samples of the rates, at 200 Hz, with options of ``packet`` or functions of the packet's number."""
     parts = []
-    for number, at in enumerate(range(0, len(RATES), size)):
-        own = {name: value(number) for name, value in options.items() if callable(value)}
-        rest = {name: value for name, value in options.items() if not callable(value)}
-        parts.append(packet(RATES[at : at + size], total=at + size, **own, **rest))
+    for number, at in enumerate(range(0, len(RATES), 20)):
+        given = {name: value(number) if callable(value) else value for name, value in options.items()}
+        parts.append(packet(RATES[at : at + 20], total=at + 20, **given))
     return parts

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, BinaryIO, Literal
+from typing import TYPE_CHECKING, Annotated, BinaryIO
 
 from pydantic import Field
 
@@ -21,13 +21,12 @@ from rsvib_torch.commands.shared_options import CameraOptions, RangeOptions, che
 from rsvib_torch.commands.terminal import Answer, error_line, warn
 from rsvib_torch.files.atomic import check_writable
 from rsvib_torch.files.reading import Table
-from rsvib_torch.options import BorderName, TrackerOptions, method_options
+from rsvib_torch.options import BorderName, PixelFormat, TrackerOptions, method_options
 from rsvib_torch.text import number_of
 
 if TYPE_CHECKING:
     from rsvib_torch.config import Config
 
-PixelFormatName = Literal["gray8", "gray16le", "rgb24", "bgr24"]
 _AT_LEAST_2 = Annotated[int, Field(ge=2)]
 
 
@@ -43,7 +42,7 @@ class LiveOptions(CameraOptions, RangeOptions):
     """Show the restored frames at http://127.0.0.1:PORT."""
     size: str | None = option(None, metavar="WIDTHxHEIGHT")
     """Size of the frames on standard input, e.g. 1024x768."""
-    pixel_format: PixelFormatName = "gray8"
+    pixel_format: PixelFormat = "gray8"
     """Pixels of the frames on standard input."""
     realtime: bool = False
     """Read a file at its own rate, and drop frames like a camera."""

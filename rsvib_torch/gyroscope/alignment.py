@@ -6,14 +6,14 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, ParamSpec, Protocol, overload
+from typing import Any, ParamSpec, Protocol, overload
 
 import numpy as np
 import torch
 from pydantic import Field
 from torch import Tensor
 
-from rsvib_torch.checks.validation import Extensible, Number
+from rsvib_torch.checks.validation import Number
 from rsvib_torch.checks.validation import options as option_group
 from rsvib_torch.checks.values import check_single
 from rsvib_torch.detection.measurements import Measurements
@@ -38,7 +38,7 @@ from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array, table, tensor
-from rsvib_torch.options import BandOptions, MaskedInputOptions, Registration, RegistrationOptions
+from rsvib_torch.options import OffsetOptions
 from rsvib_torch.results.presentation import JudgedResult
 from rsvib_torch.results.reason import Reason
 from rsvib_torch.text import measured_text, wrapped
@@ -118,12 +118,9 @@ class FittedClock:
 
 
 @option_group
-class AlignOptions(BandOptions, MaskedInputOptions):
+class AlignOptions(OffsetOptions):
     """Options of ``align_motion``; bands are those of the start, and not used for angular rates."""
 
-    registration: Annotated[Registration, Extensible] | None = Field(
-        default=None, description='Method of the bands, for a motion; by default "ncc".'
-    )
     camera: Camera | None = Field(
         default=None, description="Focal length and lens, for angular rates; by default the focal length is fitted."
     )
@@ -143,15 +140,6 @@ class AlignOptions(BandOptions, MaskedInputOptions):
         default=False,
         description="Whether to fit the row time as well, with angular rates; ``timing`` has the start value.",
     )
-
-    def bands(self) -> RegistrationOptions:
-        """The row bands."""
-        return RegistrationOptions(
-            registration=self.registration or "ncc",
-            band_rows=self.band_rows,
-            band_step=self.band_step,
-            search=self.search,
-        )
 
 
 class _AlignsMotion(Protocol[P]):
@@ -235,20 +223,18 @@ def align_motion(
     if isinstance(recorded, AngularRates):
         images = frames_from_row_order(grey[0], timing)
         masks = [None] * len(images) if stack.valid is None else frames_from_row_order(stack.valid[0], timing)
-        starts = timing.in_row_order().frame_starts(len(images)).cpu()
+        starts = timing.in_row_order().frame_starts(len(images)).tolist()
         return align_rates(
-            corner_tracks(zip(range(len(images)), images, masks, strict=True), starts.tolist(), timing),
-            torch.stack([starts[:-1], starts[1:]], -1),
-            grey.shape[2:],
+            corner_tracks(zip(range(len(images)), images, masks, strict=True), starts, timing),
             timing,
             recorded,
             options.camera,
             offsets=options.offsets,
             fit_scale=options.fit_scale,
-            fit_focal_length=options.camera is None or options.fit_gain,
+            fit_gain=options.fit_gain,
             fit_row_time=options.fit_row_time,
         )
-    rowwise, start = start_of_stack(stack, timing, options.bands())
+    rowwise, start = start_of_stack(stack, timing, options)
     measured, (first, last) = start.measurements, record_of(stack, rowwise)
     turned = recorded.to_row_order(timing).to("cpu")
     low, high = offset_range(turned.start, turned.end, first, last, options.offsets)

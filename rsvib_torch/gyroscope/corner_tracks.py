@@ -25,17 +25,22 @@ class CornerTracks:
 
     pair: Tensor  # (M,) index of the pair of frames, ascending
     cell: Tensor  # (M,) index of the cell of the frame
-    starts: Tensor  # (M, 2) s, exposure starts of the first rows of both frames
-    rows: Tensor  # (M, 2) row times from there to the rows of the corner, in both frames
+    rows: Tensor  # (M, 2) row times from the first rows of both frames to the rows of the corner
     place: Tensor  # (M, 2) px from the centre of the frame, (x, y) in the earlier frame
     offsets: Tensor  # (M, 2) px, (x, y)
-    num_pairs: int  # pairs of frames
-    first_frames: Tensor  # (P,) number of the earlier frame of each pair
-    radius: float  # px, root-mean-square distance of the pixels from the centre
+    starts: Tensor  # (P, 2) s, exposure starts of the first rows of both frames of each pair
+    size: tuple[int, int]  # (height, width) of the frames in px
+    exposure_time: float  # s
 
-    def times(self, row_time: float) -> Tensor:
-        """(M, 2) s, exposure starts of the corners in both frames."""
-        return self.starts + self.rows * row_time
+    @property
+    def radius(self) -> float:
+        """Root-mean-square distance of the pixels from the centre in px."""
+        height, width = self.size
+        return float((height**2 + width**2 - 2) / 12) ** 0.5
+
+    def times(self, row_time: float, part: float = 0.5) -> Tensor:
+        """(M, 2) s, in the exposures of the corners in both frames, of which a ``part`` 0 ... 1 is over."""
+        return self.starts[self.pair] + self.rows * row_time + part * self.exposure_time
 
     def roughly(self) -> Tensor:
         """(M, 2, 2) information for a start: 1 for displacements near the median of their pair, and 0."""
@@ -89,7 +94,7 @@ def tracks_of_pairs(
     """
     if not followed:
         raise ValueError("no two different frames follow each other")
-    first_frames, pairs = np.array([*followed]), list(followed.values())
+    pairs = list(followed.values())
     enough = np.array([len(pair.rows) >= _LEAST_CORNERS for pair in pairs])
     if enough.mean() < 0.5:
         raise ValueError(
@@ -100,19 +105,17 @@ def tracks_of_pairs(
     used = enough[corners.pairs]
     pair, offsets, times = corners.pairs[used], corners.offsets[used], corners.times[used]
     place = corners.places[used] - 0.5 * offsets
-    times_of_frames = np.array(starts)
-    of_frames = np.stack([times_of_frames[first_frames], times_of_frames[first_frames + 1]], -1)[pair]
+    of_pairs = np.array([[starts[number], starts[number + 1]] for number in followed])
     cells = np.floor((place / [width, height] + 0.5) * [CELL_COLUMNS, CELL_ROWS]).astype(np.int64)
     return CornerTracks(
         pair=torch.from_numpy(pair),
         cell=torch.from_numpy(cells @ [1, CELL_COLUMNS]),
-        starts=tensor(of_frames),
-        rows=tensor((times - of_frames - 0.5 * timing.exposure_time) / timing.row_time),
+        rows=tensor((times - of_pairs[pair] - 0.5 * timing.exposure_time) / timing.row_time),
         place=tensor(place),
         offsets=tensor(offsets),
-        num_pairs=len(pairs),
-        first_frames=torch.from_numpy(first_frames),
-        radius=float((height**2 + width**2 - 2) / 12) ** 0.5,
+        starts=tensor(of_pairs),
+        size=size,
+        exposure_time=timing.exposure_time,
     )
 
 

@@ -18,7 +18,7 @@ from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, angular_rates
 from rsvib_torch.numerics.tables import Array
 
 _MAX_PACKETS = 10**5  # 28 hours; cameras write one per second
-_SMALLEST_TURN = 1e-3  # half of an angle in rad; 1 px with a focal length of 500 px
+_SMALLEST_TURN = 2e-3  # rad; 1 px with a focal length of 500 px
 
 _NUMBERS = {
     b"b": "i1", b"B": "u1", b"s": ">i2", b"S": ">u2", b"l": ">i4", b"L": ">u4", b"f": ">f4", b"d": ">f8", b"j": ">i8",
@@ -62,7 +62,7 @@ class CameraTrack:
     @property
     def stabilised(self) -> bool:
         """Whether the camera has stabilised its images."""
-        return self.turned > 2 * _SMALLEST_TURN
+        return self.turned > _SMALLEST_TURN
 
     def exposures_at(self, times: Array) -> Array:
         """Exposures in s of frames at times in s of the video."""
@@ -149,8 +149,8 @@ class _Part:
     stabilised: bool = False  # whether the images are turned against the camera
 
 
-def _entries(data: bytes) -> Iterator[tuple[bytes, bytes, int, int, bytes]]:
-    """Key, type, size of a value, number of values, and content of the GPMF entries in ``data``."""
+def _entries(data: bytes) -> Iterator[tuple[bytes, bytes, int, bytes]]:
+    """Key, type, size of a value, and content of the GPMF entries in ``data``."""
     place = 0
     while place + 8 <= len(data):
         key, kind, size, count = struct.unpack_from(">4scBH", data, place)
@@ -159,7 +159,7 @@ def _entries(data: bytes) -> Iterator[tuple[bytes, bytes, int, int, bytes]]:
         length = size * count
         if place + 8 + length > len(data):
             raise IndexError(f"a GPMF entry {key!r} of {length} bytes in {len(data) - place - 8} bytes")
-        yield key, kind, size, count, data[place + 8 : place + 8 + length]
+        yield key, kind, size, data[place + 8 : place + 8 + length]
         place += 8 + (length + 3) // 4 * 4
 
 
@@ -188,13 +188,13 @@ def _parts(packets: Iterator[_Packet]) -> Iterator[_Part]:
             part = next(filter(None, (_part(stream, packet, earliest) for stream in streams)), None)
             if part is not None:
                 chosen = number
-                yield replace(part, stabilised=max(map(_largest_turn, streams)) > 2 * _SMALLEST_TURN)
+                yield replace(part, stabilised=max(map(_largest_turn, streams)) > _SMALLEST_TURN)
                 break
 
 
 def _devices(data: bytes) -> Iterator[tuple[bytes, list[bytes]]]:
     """Number and streams of each device in a packet."""
-    for key, _, _, _, device in _entries(data):
+    for key, *_, device in _entries(data):
         if key == b"DEVC":
             entries = [(name, content) for name, *_, content in _entries(device)]
             number = next((content for name, content in entries if name == b"DVID"), b"")
@@ -203,8 +203,7 @@ def _devices(data: bytes) -> Iterator[tuple[bytes, list[bytes]]]:
 
 def _found(stream: bytes, key: bytes) -> Array | None:
     """Values (N, C) of the entry of a stream that has a key; None if there is none."""
-    found = next(((kind, size, content) for name, kind, size, _, content in _entries(stream) if name == key), None)
-    return None if found is None else _values(*found)
+    return next((_values(kind, size, content) for name, kind, size, content in _entries(stream) if name == key), None)
 
 
 def _stamp(stream: bytes) -> float | None:

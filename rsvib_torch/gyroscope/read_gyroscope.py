@@ -25,7 +25,6 @@ from rsvib_torch.text import one_line, quoted
 
 RateUnit = Literal["rad/s", "deg/s"]
 _RADIANS = {"rad/s": 1.0, "deg/s": math.pi / 180}
-_UNIT = {"rad/s": "rad/s", "rad_s": "rad/s", "rads": "rad/s", "deg/s": "deg/s", "deg_s": "deg/s", "dps": "deg/s"}
 _TIME_NAME = re.compile(r"(?:t|time|timestamp)(?:[ _]?[(\[]?(?P<unit>s|ms|us|ns)[)\]]?)?")
 _RATE_NAME = re.compile(
     r"(?:gyro(?:scope)?[ _]?|angular_velocity[ _]?|rate[ _]?|omega[ _]?|[grw])?(?P<axis>[xyz])"
@@ -36,13 +35,10 @@ _RATE_NAME = re.compile(
 def _read_table(path: Path, unit: str | None, time_unit: str | None) -> AngularRates:
     """Angular rates of a CSV file, see ``read_gyroscope``."""
     with path.open(newline="", encoding="utf-8-sig") as file:
-        try:
-            lines = text_lines(path, file)
-            names = [name.strip().lower() for name in next(csv.reader(lines), [])]
-            columns, time_unit, unit = _columns(path, names, time_unit, unit)
-            table = rows_of_numbers(path, lines, names, columns, 2)
-        except (UnicodeDecodeError, csv.Error) as error:
-            raise ValueError(f"{path}: not a CSV file: {error}") from error
+        lines = text_lines(path, file)
+        names = [name.strip().lower() for name in next(csv.reader(lines), [])]
+        columns, time_unit, unit = _columns(path, names, time_unit, unit)
+        table = rows_of_numbers(path, lines, names, columns, 2)
     return angular_rates(path, table[:, 0] * SECONDS[time_unit], table[:, 1:] * _RADIANS[unit], f"{path.name}, CSV")
 
 
@@ -62,7 +58,8 @@ def _columns(path: Path, names: list[str], time_unit: str | None, unit: str | No
                 )
             found[quantity] = column
             if match["unit"]:
-                units[kind].add(match["unit"] if kind == "time" else _UNIT[match["unit"]])
+                of_rate = "rad/s" if match["unit"].startswith("rad") else "deg/s"
+                units[kind].add(match["unit"] if kind == "time" else of_rate)
     missing = [quantity for quantity in ("time", "x", "y", "z") if quantity not in found]
     if missing:
         what = "time" if missing[0] == "time" else f"rate about {missing[0]}"
@@ -95,17 +92,14 @@ def _is_gcsv(head: bytes) -> bool:
 def _read_gcsv(path: Path) -> AngularRates:
     """Angular rates of a gyroflow log."""
     with path.open(newline="", encoding="utf-8-sig") as file:
-        try:
-            lines = text_lines(path, file)
-            header, names, count = _header(path, lines)
-            columns = next((list(rates) for rates in _RATES if set(rates) <= set(names)), None)
-            if columns is None:
-                shown = one_line(",".join(names), 100)
-                raise ValueError(f"{path}: columns t, gx, gy and gz expected, the log has {shown}")
-            wanted = ["t", *columns]
-            table = rows_of_numbers(path, lines, names, [names.index(name) for name in wanted], count + 1)
-        except (UnicodeDecodeError, csv.Error) as error:
-            raise ValueError(f"{path}: not a gyroflow log: {error}") from error
+        lines = text_lines(path, file)
+        header, names, count = _header(path, lines)
+        columns = next((list(rates) for rates in _RATES if set(rates) <= set(names)), None)
+        if columns is None:
+            shown = one_line(",".join(names), 100)
+            raise ValueError(f"{path}: columns t, gx, gy and gz expected, the log has {shown}")
+        wanted = ["t", *columns]
+        table = rows_of_numbers(path, lines, names, [names.index(name) for name in wanted], count + 1)
     orientation = header.get("orientation", "XYZ")
     times, rates = table[:, 0] * _scale(path, header, "tscale"), table[:, 1:] * _scale(path, header, "gscale")
     source = f"{path.name}, gyroflow log, orientation {orientation}"
@@ -149,7 +143,7 @@ class _GyroscopeFormat:
 _FORMATS = (
     _GyroscopeFormat("gyroflow log (.gcsv)", _is_gcsv, lambda path, *_: _read_gcsv(path)),
     _GyroscopeFormat("GoPro video with a GPMF track (.mp4)", is_mp4, lambda path, *_: read_gpmf(path)),
-    _GyroscopeFormat("CSV", lambda _: True, _read_table, has_units=False),
+    _GyroscopeFormat("CSV file", lambda _: True, _read_table, has_units=False),
 )
 
 
@@ -203,6 +197,9 @@ def read_gyroscope(
     found = next(one for one in _FORMATS if one.matches(head))
     if found.has_units and (unit is not None or time_unit is not None):
         raise ValueError(f"{path}: a {found.name} states its units; omit unit and time_unit")
-    rates = found.read(path, unit, time_unit)
+    try:
+        rates = found.read(path, unit, time_unit)
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{path}: not a {found.name}: {error}") from error
     check_times(path, rates.times.numpy(), time_unit or "s", longest_gap=float("inf"))
     return rates

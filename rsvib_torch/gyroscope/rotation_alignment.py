@@ -1,7 +1,6 @@
 """Alignment of the angular rates of a gyroscope with frames: clock, axes, bias, focal length, row time."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -11,15 +10,8 @@ from rsvib_torch.checks.values import check_number
 from rsvib_torch.detection.verdict import recording_reasons
 from rsvib_torch.gyroscope.corner_tracks import CornerTracks
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, orientation_matrix
-from rsvib_torch.gyroscope.rotation_fit import (
-    NAMES,
-    RotationFit,
-    RotationModel,
-    components_of,
-    fit_robustly,
-    image_components,
-)
-from rsvib_torch.gyroscope.rotation_search import OrientationSearch, Start, search_orientations
+from rsvib_torch.gyroscope.rotation_fit import RotationFit, RotationModel, fit_robustly, image_components
+from rsvib_torch.gyroscope.rotation_search import Start, search_orientations
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
@@ -173,42 +165,39 @@ def outside(offset: float, std: float, limits: tuple[float, float] | None) -> li
 
 def align_rates(
     tracks: CornerTracks,
-    starts: Tensor,
-    size: Sequence[int],
     timing: SensorTiming,
     rates: AngularRates,
     camera: Camera | None = None,
     *,
     offsets: tuple[float, float] | None = None,
     fit_scale: bool = True,
-    fit_focal_length: bool = True,
+    fit_gain: bool = False,
     fit_row_time: bool = False,
 ) -> RotationAlignment:
-    """``align_motion`` for angular rates, from the corners of pairs of frames of ``size`` (rows, pixels of a row).
-
-    The exposures of the frames of each pair start at ``starts`` (P, 2) in s.
-    """
-    height, width = size
+    """``align_motion`` for angular rates, from the corners of pairs of frames."""
     if camera is not None:
-        camera.check_size(*((height, width) if timing.scan_axis == -1 else (width, height)))
-    begin, last = float(starts[0, 0]), float(starts[-1, 1]) + height * timing.row_time + timing.exposure_time
+        camera.check_size(tracks.size[1], tracks.size[0])
+    rows = tracks.size[int(timing.scan_axis)]
+    begin, last = float(tracks.starts[0, 0]), float(tracks.starts[-1, 1])
+    last += rows * timing.row_time + timing.exposure_time
     limits = offset_range(rates.start, rates.end, begin, last, offsets)
     middle = 0.5 * (begin + last)
+    fit_focal_length = camera is None or fit_gain
     known = None if fit_focal_length else camera
-    free = [True, True, True, True, fit_scale, fit_focal_length, fit_row_time]
+    free = (True, True, True, True, fit_scale, fit_focal_length, fit_row_time)
 
     def parameters(start: Start, row_time: float) -> Tensor:
         values = [0.0, 0.0, 0.0, start.offset + middle, 1.0, start.focal_length, row_time]
         return torch.tensor(values, dtype=torch.float64)
 
     # 1. Axes and offsets that explain the displacements best, and the fit from there with the smallest residuals.
-    search = search_orientations(tracks, tracks.roughly(), rates, timing.row_time, timing.exposure_time, limits, known)
+    search = search_orientations(tracks, tracks.roughly(), rates, timing.row_time, limits, known)
     lens = camera or Camera(search.starts[0].focal_length)
     first = search.starts[0]
     near = [first, *(start for start in search.starts[1:3] if start.cost < _NEAR_COST * first.cost)]
-    model = RotationModel(tracks, rates, first.orientation, lens, timing.exposure_time, middle)
+    model = RotationModel(tracks, rates, first.orientation, lens, middle, free)
     fits = [
-        fit_robustly(replace(model, orientation=start.orientation), parameters(start, timing.row_time), free)
+        fit_robustly(replace(model, orientation=start.orientation), parameters(start, timing.row_time))
         for start in near
     ]
     fit = min(fits, key=lambda one: one.errors.sigma / float((one.errors.weight > 0).double().mean()))
@@ -217,63 +206,56 @@ def align_rates(
     # 2. What does not follow the gyroscope has no weight in a second search, and parallax little.
     row_time = float(fit.parameters[6])
     lens = replace(lens, focal_length=float(fit.parameters[5]))
-    again = search_orientations(tracks, fit.information(), rates, row_time, timing.exposure_time, limits, lens)
+    again = search_orientations(tracks, fit.information(), rates, row_time, limits, lens)
     best = again.starts[0]
     if best.orientation != first.orientation or abs(best.offset - first.offset) > 5 / rates.sample_rate:
         model = replace(model, orientation=best.orientation)
-        fit = fit_robustly(model, parameters(best, timing.row_time), free)
+        fit = fit_robustly(model, parameters(best, timing.row_time))
 
     # 3. Other axes and offsets that explain the frames as well.
     def explains(start: Start) -> bool:
         near = start.cost < _MAX_COST * best.cost
-        return near and fit.significance(start.orientation, parameters(start, row_time), free) < _CERTAIN
+        return near and fit.significance(start.orientation, parameters(start, row_time)) < _CERTAIN
 
     others = [start for start in again.starts if start.orientation != fit.model.orientation][:_MOST_OTHERS]
     axes = [start.orientation for start in others if explains(start)]
     other = next((start.offset for start in again.other_offsets[:_MOST_OTHERS] if explains(start)), None)
-    return _result(fit, again, axes, other, free, starts, size, offsets)
+    ambiguous: list[Reason] = []
+    if again.mirrored is not None:
+        ambiguous.append(Reason("axes_mirrored", details={"axes": again.mirrored}))
+    if axes:
+        ambiguous.append(Reason("axes_ambiguous", details={"axes": ", ".join(axes)}))
+    return _result(fit, ambiguous, other, rows, offsets)
 
 
 def _result(
-    fit: RotationFit,
-    search: OrientationSearch,
-    axes: list[str],
-    other: float | None,
-    free: list[bool],
-    starts: Tensor,
-    size: Sequence[int],
-    offsets: tuple[float, float] | None,
+    fit: RotationFit, ambiguous: list[Reason], other: float | None, rows: int, offsets: tuple[float, float] | None
 ) -> RotationAlignment:
-    height, side = size[0], max(size)
-    model, radius = fit.model, fit.model.tracks.radius
-    values = dict(zip(NAMES, fit.parameters.tolist(), strict=True))
+    """The result of a fit to frames whose readout has a number of rows; an ``other`` offset in s explains them too."""
+    model, radius, starts = fit.model, fit.model.tracks.radius, fit.model.tracks.starts
+    *_, at, scale, focal_length, row_time = fit.parameters.tolist()
     std = fit.covariance.diagonal().clamp(min=0.0).sqrt()
-    at, scale, focal_length, row_time = (values[name] for name in ("at", "scale", "focal length", "row time"))
     gradient = torch.zeros(7, dtype=torch.float64)
     gradient[3], gradient[4] = 1.0, -model.middle  # offset = at - scale * middle
     offset, offset_std = at - scale * model.middle, float(gradient @ fit.covariance @ gradient) ** 0.5
-    middles = starts + 0.5 * (height - 1) * row_time + 0.5 * model.exposure_time
-    predicted = components_of(model.rates, model.orientation, fit.parameters, middles, model.middle)
+    middles = starts + 0.5 * (rows - 1) * row_time + 0.5 * model.tracks.exposure_time
+    predicted = model.components(fit.parameters, middles)
     units = torch.tensor([1.0, 1.0, 1 / radius], dtype=torch.float64)
     unexplained = fit.errors.effects[:3] * units
-    first, last = float(middles[0, 0]) - 0.5 * height * row_time, float(middles[-1, 1]) + 0.5 * height * row_time
+    first, last = float(middles[0, 0]) - 0.5 * rows * row_time, float(middles[-1, 1]) + 0.5 * rows * row_time
     clock = scale * (torch.tensor([first, last], dtype=torch.float64) - model.middle) + at
 
     moved = (predicted - predicted.mean(0)).square().mean(0).sqrt()
     reasons = recording_reasons(moved[:2].tolist(), unexplained[:2].tolist(), other)
-    if search.mirrored is not None:
-        reasons.append(Reason("axes_mirrored", details={"axes": search.mirrored}))
-    if axes:
-        reasons.append(Reason("axes_ambiguous", details={"axes": ", ".join(axes)}))
-    reasons += _uncertain(fit, free, std, side) + outside(offset, offset_std, offsets)
+    reasons += ambiguous + _uncertain(fit, std) + outside(offset, offset_std, offsets)
     steps = model.rates.times.diff()
     inside = (model.rates.times[1:] > clock[0]) & (model.rates.times[:-1] < clock[1])
     longest, allowed = float(steps[inside].amax()), 4 * float(steps.median())
     if longest > allowed:
         reasons.append(Reason("gap_in_recording", None, longest, allowed))
-    readout, shortest = row_time * height, float(starts.diff(dim=1).amin())
+    readout, shortest = row_time * rows, float(starts.diff(dim=1).amin())
     if readout > shortest:
-        reasons.append(Reason("readout_too_long", None, readout, shortest, {"rows": height}))
+        reasons.append(Reason("readout_too_long", None, readout, shortest, {"rows": rows}))
     translation = fit.translation + fit.effects[:, 3:]
     return RotationAlignment(
         motion=_motion(fit, clock),
@@ -299,9 +281,11 @@ def _result(
     )
 
 
-def _uncertain(fit: RotationFit, free: list[bool], std: Tensor, side: int) -> list[Reason]:
-    """Reasons against parameters that are not determined; ``side`` is the longer one of the frames in px."""
+def _uncertain(fit: RotationFit, std: Tensor) -> list[Reason]:
+    """Reasons against parameters that are not determined, with standard deviations (7,)."""
     reasons = []
+    *_, fits_focal_length, fits_row_time = fit.model.free
+    side = max(fit.model.tracks.size)
     focal_length, row_time = fit.parameters[5:7].tolist()
     focal_length_std, row_time_std = std[5:7].tolist()
     allowed = _MAX_FOCAL_LENGTH_STD * focal_length
@@ -309,10 +293,10 @@ def _uncertain(fit: RotationFit, free: list[bool], std: Tensor, side: int) -> li
         details = {"focal_length": focal_length}
         reasons.append(Reason("focal_length_uncertain", None, focal_length_std, allowed, details))
     shortest, longest = (sides * side for sides in _FOCAL_LENGTHS)
-    if free[5] and not shortest <= focal_length <= longest:
+    if fits_focal_length and not shortest <= focal_length <= longest:
         limit = shortest if focal_length < shortest else longest
         reasons.append(Reason("focal_length_implausible", None, focal_length, limit, {"times": focal_length / side}))
-    if free[6] and row_time_std > _MAX_ROW_TIME_STD * row_time:
+    if fits_row_time and row_time_std > _MAX_ROW_TIME_STD * row_time:
         reasons.append(Reason("row_time_uncertain", None, row_time_std / row_time, _MAX_ROW_TIME_STD))
     if not math.isfinite(float(std.sum())):
         reasons.append(Reason("fit_not_converged"))

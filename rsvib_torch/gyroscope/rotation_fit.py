@@ -14,7 +14,6 @@ maximum likelihood).
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -47,14 +46,7 @@ _DRAWS = 16
 _LEAST_STD = 1e-3  # px, of corners and of effects; below every error
 
 
-def components_of(rates: AngularRates, orientation: str, parameters: Tensor, times: Tensor, middle: float) -> Tensor:
-    """(M, 3) X and Y in px and theta in rad between two times (M, 2) in s on the clock of the frames."""
-    first, last = (parameters[3] + parameters[4] * (times - middle)).unbind(-1)
-    turned = rates.rotation(first, last) - (last - first)[:, None] * parameters[:3]
-    return image_components(turned @ orientation_matrix(orientation).T, parameters[5])
-
-
-def image_components(turned: Tensor, focal_length: Tensor) -> Tensor:
+def image_components(turned: Tensor, focal_length: Tensor | float) -> Tensor:
     """X and Y in px and theta in rad of rotation vectors (..., 3) of a camera."""
     pitch, yaw, roll = turned.unbind(-1)
     return torch.stack([-focal_length * yaw, focal_length * pitch, -roll], -1)
@@ -68,8 +60,14 @@ class RotationModel:
     rates: AngularRates  # the recording
     orientation: str  # name of the assignment of the axes
     camera: Camera  # principal point and lens; its focal length is a parameter of the fit
-    exposure_time: float  # s
     middle: float  # s, mid-time of the frames
+    free: tuple[bool, ...]  # (7,) whether parameters are fitted
+
+    def components(self, parameters: Tensor, times: Tensor) -> Tensor:
+        """(M, 3) X and Y in px and theta in rad between two times (M, 2) in s on the clock of the frames."""
+        first, last = (parameters[3] + parameters[4] * (times - self.middle)).unbind(-1)
+        turned = self.rates.rotation(first, last) - (last - first)[:, None] * parameters[:3]
+        return image_components(turned @ orientation_matrix(self.orientation).T, parameters[5])
 
     def predicted(self, parameters: Tensor) -> Tensor:
         """Displacements (M, 2) in px by the rotation, for parameters (7,) in the order of ``NAMES``."""
@@ -79,17 +77,16 @@ class RotationModel:
 
     def _displaced(self, parameters: Tensor, node: float) -> Tensor:
         """Displacements (M, 2) in px at a place 0 ... 1 within the exposures."""
-        times = self.tracks.times(float(parameters[6])) + node * self.exposure_time
-        components = components_of(self.rates, self.orientation, parameters, times, self.middle)
+        components = self.components(parameters, self.tracks.times(float(parameters[6]), node))
         camera = replace(self.camera, focal_length=float(parameters[5]))
         return camera.displacement_of_rays(components, *camera.rays(*self.tracks.place.unbind(-1)))
 
-    def slopes(self, parameters: Tensor, free: Sequence[bool]) -> tuple[Tensor, Tensor]:
+    def slopes(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
         """(M, 2, 7) derivatives of ``predicted``, 0 for parameters that are not free, and (M, 2, 3) by components."""
         camera = replace(self.camera, focal_length=float(parameters[5]))
         x, y = self.tracks.place.unbind(-1)
         factors = camera.factors(x, y, 3)
-        times = self.tracks.times(float(parameters[6])) + 0.5 * self.exposure_time
+        times = self.tracks.times(float(parameters[6]))
         clock = parameters[3] + parameters[4] * (times - self.middle)
         half = 0.5 / self.rates.sample_rate
         rates = (self.rates.rotation(clock - half, clock + half) / (2 * half)) - parameters[:3]  # (M, 2, 3) rad/s
@@ -109,7 +106,7 @@ class RotationModel:
         columns.append(((longer - shorter) / (2 * step[5]))[..., None])
         row = difference(parameters[4] * self.tracks.rows)
         columns.append(factors @ image_components(row @ matrix, parameters[5])[..., None])
-        return torch.cat(columns, -1) * torch.tensor(free), factors
+        return torch.cat(columns, -1) * torch.tensor(self.free), factors
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,18 +134,22 @@ class RotationFit:
     cost: float  # sum of squares over their variance
     inflation: float = 1.0  # variance of the parameters over that of independent corners
 
-    def significance(self, orientation: str, start: Tensor, free: Sequence[bool]) -> float:
+    def significance(self, orientation: str, start: Tensor) -> float:
         """Difference of the sums of squares of the best fit with other axes or another start, in correlated errors."""
         fit = replace(self, model=replace(self.model, orientation=orientation), parameters=start)
-        for _ in range(_STEPS):
-            fit, *_ = _solved(fit, _linear(fit, _Residuals.at(fit, free)))
-        return (_solved(fit, _linear(fit, _Residuals.at(fit, free)))[0].cost - self.cost) / self.inflation
+        for _ in range(_STEPS + 1):  # the cost is that before the last step
+            fit = fit.stepped()
+        return (fit.cost - self.cost) / self.inflation
 
     def unshrunk(self) -> Tensor:
         """(P, 3) px, X, Y and radius theta of every pair from its corners alone."""
         loose = torch.cat([torch.full((3,), 1e3, dtype=torch.float64), self.errors.effects[3:]])
-        fit = replace(self, errors=replace(self.errors, effects=loose))
-        return _solved(fit, _linear(fit, _Residuals.at(fit, [False] * 7)))[0].effects[:, :3]
+        model = replace(self.model, free=(False,) * len(NAMES))
+        return replace(self, model=model, errors=replace(self.errors, effects=loose)).stepped().effects[:, :3]
+
+    def stepped(self) -> "RotationFit":
+        """The fit after a step of Gauss-Newton with the same weights."""
+        return _solved(self, _linear(self, _Residuals.at(self)))[0]
 
     def information(self) -> Tensor:
         """(M, 2, 2) px^-2, inverse covariances of the displacements of the corners."""
@@ -165,14 +166,14 @@ class RotationFit:
 def _parallax(fit: RotationFit, translation: Tensor) -> Tensor:
     """(M, 2) px by the translation in a frame period, in proportion to the time between the exposures of a corner."""
     tracks = fit.model.tracks
-    duration = tracks.times(float(fit.parameters[6])).diff() / tracks.starts.diff()
+    duration = tracks.times(float(fit.parameters[6])).diff() / tracks.starts[tracks.pair].diff()
     place = (tracks.place - torch.tensor(fit.model.camera.principal_point, dtype=torch.float64)) / tracks.radius
     return duration * (translation[..., :2] + translation[..., 2:] * place)
 
 
 def _sums(tracks: CornerTracks, values: Tensor) -> Tensor:
     """Sums (P, ...) over the corners of every pair of frames."""
-    return values.new_zeros(tracks.num_pairs, *values.shape[1:]).index_add(0, tracks.pair, values)
+    return values.new_zeros(len(tracks.starts), *values.shape[1:]).index_add(0, tracks.pair, values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,15 +185,11 @@ class _Residuals:
     turned: Tensor  # (M, 2, 3) of the prediction by the effects X, Y, radius theta
 
     @classmethod
-    def at(cls, fit: RotationFit, free: Sequence[bool]) -> "_Residuals":
+    def at(cls, fit: RotationFit) -> "_Residuals":
         tracks = fit.model.tracks
-        slopes, factors = fit.model.slopes(fit.parameters, free)
+        slopes, factors = fit.model.slopes(fit.parameters)
         turned = factors * torch.tensor([1.0, 1.0, 1 / tracks.radius])
         return cls(tracks.offsets - fit.model.predicted(fit.parameters), slopes, turned)
-
-    def moved(self, change: Tensor) -> "_Residuals":
-        """Those after a small change (7,) of the parameters."""
-        return replace(self, values=self.values - self.slopes @ change)
 
 
 @dataclass(frozen=True, eq=False)
@@ -311,19 +308,18 @@ def _biweight(size: Tensor) -> Tensor:
     return (1 - (size / _CUT).square().clamp(max=1.0)).square()
 
 
-def fit_robustly(model: RotationModel, start: Tensor, free: Sequence[bool]) -> RotationFit:
-    """Fit the ``free`` of (7,) parameters; corners that do not follow the gyroscope have no weight."""
+def fit_robustly(model: RotationModel, start: Tensor) -> RotationFit:
+    """Fit the free ones of (7,) parameters; corners that do not follow the gyroscope have no weight."""
     tracks = model.tracks
     residual = tracks.offsets - model.predicted(start)
     follows = _following(tracks, tracks.offsets - residual).double()
-    none = torch.zeros(tracks.num_pairs, 6, dtype=torch.float64)
-    errors = Errors(follows, torch.ones_like(follows), 1.0, 1.0, none[0], 1.0)
-    fit = RotationFit(model, start, torch.zeros(7, 7).double(), none[0, :3], none, errors, 0.0)
     # 1. Without a translation.
+    none = torch.zeros(len(tracks.starts), 6, dtype=torch.float64)
     sigma = max(1.4826 * float(residual[follows > 0].abs().median()), _LEAST_STD)
     spread = torch.tensor([_START_ROTATION] * 3 + [_LEAST_STD] * 3, dtype=torch.float64)
-    errors = replace(errors, sigma=sigma, depth=0.0, effects=spread, mean_translation=_LEAST_STD)
-    still = _weighted(replace(fit, errors=errors), free, follows)
+    errors = Errors(follows, torch.ones_like(follows), sigma, 0.0, spread, _LEAST_STD)
+    fit = RotationFit(model, start, torch.zeros(7, 7).double(), none[0, :3], none, errors, 0.0)
+    still = _weighted(fit, follows)
     # 2. With one, from its direction with the least median of the displacements across its lines.
     sampled = (follows > 0).nonzero()[:, 0]
     sampled = sampled[:: max(1, len(sampled) // 2000)]
@@ -335,29 +331,29 @@ def fit_robustly(model: RotationModel, start: Tensor, free: Sequence[bool]) -> R
     spread[3:] = 0.2 * size.abs() + _START_TRANSLATION
     sigma = max(1.4826 * float(off[best]), _LEAST_STD)
     errors = replace(errors, sigma=sigma, depth=1.0, effects=spread, mean_translation=10 * abs(float(size)) + sigma)
-    moving = _weighted(replace(fit, translation=size * _half_sphere()[best], errors=errors), free, follows)
+    moving = _weighted(replace(fit, translation=size * _half_sphere()[best], errors=errors), follows)
     # 3. A translation must explain more than noise, as it has a part of every rotation: across its lines.
     line = moving.parallax()
     rest = tracks.offsets - model.predicted(still.parameters)
-    rest = rest - (_Residuals.at(still, free).turned @ still.effects[tracks.pair, :3, None])[..., 0]
+    rest = rest - (_Residuals.at(still).turned @ still.effects[tracks.pair, :3, None])[..., 0]
     off = (rest[:, 0] * line[:, 1] - rest[:, 1] * line[:, 0]) / line.norm(dim=-1).clamp(min=1e-9)
     across = 1.4826 * float(off[still.errors.weight > 0].abs().median())
     simpler = across < (1 + _SIGNIFICANT / len(off) ** 0.5) * moving.errors.sigma
-    return _with_correlated_errors(still if simpler else moving, free)
+    return _with_correlated_errors(still if simpler else moving)
 
 
-def _weighted(fit: RotationFit, free: Sequence[bool], follows: Tensor) -> RotationFit:
+def _weighted(fit: RotationFit, follows: Tensor) -> RotationFit:
     """Rounds of Gauss-Newton, weights and variances."""
     for number in range(_ROUNDS):
-        rest, before = _Residuals.at(fit, free), fit.parameters
+        rest, before = _Residuals.at(fit), fit.parameters
         fit, of_effects, _ = _solved(fit, _linear(fit, rest))
-        linear = _linear(fit, rest.moved(fit.parameters - before))
+        linear = _linear(fit, replace(rest, values=rest.values - rest.slopes @ (fit.parameters - before)))
         errors = _weighed(fit, linear, of_effects, follows)
         fit = replace(fit, errors=replace(errors, effects=fit.errors.effects) if number < _HELD_ROUNDS else errors)
     return fit
 
 
-def _with_correlated_errors(fit: RotationFit, free: Sequence[bool]) -> RotationFit:
+def _with_correlated_errors(fit: RotationFit) -> RotationFit:
     """The fit with the covariance for residuals that are correlated.
 
     Effects of consecutive pairs with the correlation rho count as ``(1 - rho) / (1 + rho)`` of their number, and the
@@ -365,21 +361,22 @@ def _with_correlated_errors(fit: RotationFit, free: Sequence[bool]) -> RotationF
     edges that slide), and those of a pair: the covariance follows from the sums of their influences (cluster-robust,
     Liang and Zeger 1986), where it is larger.
     """
-    pairs, errors = fit.model.tracks.num_pairs, fit.errors
+    tracks, errors, free = fit.model.tracks, fit.errors, torch.tensor(fit.model.free)
+    pairs = len(tracks.starts)
     first, later = fit.effects[:-1], fit.effects[1:]
     rho = (first * later).sum(0) / (0.5 * (first.square() + later.square()).sum(0)).clamp(min=1e-300)
     rho = rho.clamp(0.0, 0.9) if pairs > 8 else torch.zeros(6)  # fewer pairs have no known correlation
-    wide = errors.effects * ((1 + rho) / (1 - rho) * pairs / max(pairs - sum(free) / 3, 1.0)).sqrt()
-    rest = _Residuals.at(fit, free)
+    wide = errors.effects * ((1 + rho) / (1 - rho) * pairs / max(pairs - int(free.sum()) / 3, 1.0)).sqrt()
+    rest = _Residuals.at(fit)
     linear, wider = _linear(fit, rest), replace(fit, errors=replace(errors, effects=wide))
     moved, _, influence = _solved(wider, linear)
-    cells = influence.new_zeros(CELL_ROWS * CELL_COLUMNS, 7).index_add(0, fit.model.tracks.cell, influence)
+    cells = influence.new_zeros(CELL_ROWS * CELL_COLUMNS, 7).index_add(0, tracks.cell, influence)
     occupied = max(int((cells.abs().sum(-1) > 0).sum()), 2)
     clustered = cells.square().sum(0) * occupied / (occupied - 1)
     if pairs > 1:
-        clustered = torch.maximum(clustered, _sums(fit.model.tracks, influence).square().sum(0) * pairs / (pairs - 1))
+        clustered = torch.maximum(clustered, _sums(tracks, influence).square().sum(0) * pairs / (pairs - 1))
     ratio = (clustered / moved.covariance.diagonal().clamp(min=1e-300)).clamp(min=1.0)
-    inflation = float(ratio[torch.tensor(free)].mean())
+    inflation = float(ratio[free].mean())
     covariance = moved.covariance * ratio.sqrt() * ratio.sqrt()[:, None]
     # Noise of the rates, which turns all corners of a row alike: the covariance of the parameters over random draws.
     rates, generator = fit.model.rates, torch.Generator().manual_seed(0)
@@ -392,14 +389,13 @@ def _with_correlated_errors(fit: RotationFit, free: Sequence[bool]) -> RotationF
         by_noise = _solved(wider, replace(linear, residual=change))[2].sum(0)
         covariance = covariance + torch.outer(by_noise, by_noise) / _DRAWS
     # Errors in proportion to the displacements, which change neither the bias nor the time of the middle row.
-    tracks, parameters = fit.model.tracks, fit.parameters
-    row = float(tracks.rows.amax()) / 2
+    parameters, row = fit.parameters, float(tracks.rows.amax()) / 2
     gains = torch.zeros(3, 7, dtype=torch.float64)
     gains[0, 5] = _GAIN_ERROR * parameters[5] * free[5]
     gains[1, 6] = _GAIN_ERROR * parameters[6] * free[6]
     gains[1, 3] = -row * gains[1, 6]
     gains[2, 3] = _ROW_ERROR * parameters[6]
-    covariance = (covariance + gains.mT @ gains) * torch.outer(torch.tensor(free), torch.tensor(free))
+    covariance = (covariance + gains.mT @ gains) * torch.outer(free, free)
     return replace(moved, errors=errors, covariance=covariance, inflation=inflation)
 
 

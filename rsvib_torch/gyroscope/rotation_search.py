@@ -55,7 +55,6 @@ def search_orientations(
     information: Tensor,
     rates: AngularRates,
     row_time: float,
-    exposure_time: float,
     limits: tuple[float, float],
     camera: Camera | None,
 ) -> OrientationSearch:
@@ -75,7 +74,7 @@ def search_orientations(
     values, vectors = torch.linalg.eigh(information[used])
     white = values.clamp(min=0).sqrt()[..., None] * vectors.mT
     factors, moved = white @ factors, (white @ tracks.offsets[used, :, None])[..., 0]
-    times = tracks.times(row_time)[used] + 0.5 * exposure_time
+    times = tracks.times(row_time)[used]
     unknown = factors * torch.cat([times.diff().expand(-1, 3), torch.ones_like(x)[:, None]], -1)[:, None]
     factors = factors[..., :3]
 

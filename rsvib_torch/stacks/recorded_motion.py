@@ -95,14 +95,10 @@ def align_stack(
     timing = timing_from_first_frame(timing, info)
     if isinstance(recorded, AngularRates):
         pairs = compared_pairs(info.shape[0])
-        starts = timing.frame_starts(info.shape[0])
-        tracks = corner_tracks(_grey_frames(source, info, pairs, ignore), starts.tolist(), timing)
-        index = tracks.first_frames
-        size = info.shape[-2:] if timing.scan_axis == -2 else info.shape[:-3:-1]
-        of_pairs = torch.stack([starts[index], starts[index + 1]], -1)
-        fit_focal_length = camera is None or fit_gain
-        more: Table = {"offsets": offsets, "fit_focal_length": fit_focal_length, "fit_row_time": fit_row_time}
-        return align_rates(tracks, of_pairs, size, timing, recorded, camera, **more)
+        starts = timing.frame_starts(info.shape[0]).tolist()
+        tracks = corner_tracks(_grey_frames(source, info, pairs, ignore), starts, timing)
+        more: Table = {"offsets": offsets, "fit_gain": fit_gain, "fit_row_time": fit_row_time}
+        return align_rates(tracks, timing, recorded, camera, **more)
     runs, align = compared_runs(info.shape[0]), partial(align_motion, fit_gain=fit_gain, ignore=ignore)
     if len(runs) == 1:
         return align(*part_of_stack(source, info, timing, runs[0]), recorded, offsets=offsets)

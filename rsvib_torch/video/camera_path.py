@@ -241,7 +241,8 @@ class _WindowFit:
     """The robust fit of path and tones to the corners of one window."""
 
     def __init__(self, corners: Corners, interval: float, averaged: Averaged) -> None:
-        self.corners, self.step, self.averaged = corners, interval / _KNOTS, averaged
+        self.corners, self.interval, self.averaged = corners, interval, averaged
+        self.step = interval / _KNOTS
         self.start, end = float(corners.times.min()), float(corners.times.max())
         self.origin = 0.5 * (self.start + end)
         self.count = math.ceil((end - self.start) / self.step) + 3
@@ -372,11 +373,11 @@ class _WindowFit:
         other.solve(_ROUNDS)
         return other if np.median(other.distance) < _EXPLAINS_MORE * np.median(self.distance) else self
 
-    def has_blind_tone(self, interval: float) -> bool:
+    def has_blind_tone(self) -> bool:
         """Whether the frequency of a tone has been corrected to one that frames do not show."""
-        return any(_gain(tone.frequency, interval) < _MIN_GAIN for tone in self.tones if abs(tone.slope) <= _FAST)
+        return any(_gain(tone.frequency, self.interval) < _MIN_GAIN for tone in self.tones if abs(tone.slope) <= _FAST)
 
-    def keep_tones(self, interval: float) -> None:
+    def keep_tones(self) -> None:
         """Leave out insignificant tones, and those near blind frequencies that thirds of the rows contradict."""
         waves, residual = [], self.corners.offsets - self.explained(self.knots)
         for tone in self.tones:
@@ -394,7 +395,7 @@ class _WindowFit:
 
         def is_kept(tone: WindowTone, wave: NDArray[np.complex128]) -> bool:
             least = _NEARLY_BLIND if tone.apart > _MAX_APART else _MIN_GAIN
-            is_visible = abs(tone.slope) > _FAST or _gain(tone.frequency, interval) > least
+            is_visible = abs(tone.slope) > _FAST or _gain(tone.frequency, self.interval) > least
             size = math.sqrt(np.square(np.abs(tone.knots)).mean())
             return bool(
                 is_visible
@@ -516,7 +517,7 @@ def fit_window(
         best = min(trials, key=lambda trial: trial.unexplained)
         best.solve()
         found = {of: value for of, value in found.items() if of[0] != axis}
-        if best.has_blind_tone(interval):
+        if best.has_blind_tone():
             # A part of the picture that moves by itself displaces the same rows again and again: without vibration, it
             # became tones of up to 70 px at the frame rate.
             blind = round(frequency * interval) / interval
@@ -529,7 +530,7 @@ def fit_window(
     while len(fit.tones) != number:
         number = len(fit.tones)
         fit.solve()
-        fit.keep_tones(interval)
+        fit.keep_tones()
     knots = fit.knots.T / np.array([1.0, 1.0, fit.reach, fit.reach])
     residual = residual_of_most = float(np.median(fit.distance)) / _HALF
     if not fit.layer.all():  # with a subject on 40 % of the frame, tones of 0.1 px were found that are none

@@ -2,12 +2,13 @@
 
 from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, closing
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, field, replace
 from itertools import chain, count, groupby, islice
 from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from rsvib_torch.checks.validation import fields_of
 from rsvib_torch.execution.parallel import in_threads
@@ -24,7 +25,7 @@ from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, s
 from rsvib_torch.io.video import CONTAINERS, VideoReader, join_parts, part_of_video
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.options import ProcessVideoOptions, ResourceOptions, RestorationOptions, StackOptions
+from rsvib_torch.options import ProcessVideoOptions, ResourceOptions, StackOptions
 from rsvib_torch.restoration import RestorationVerdict
 from rsvib_torch.results.presentation import plain_values
 from rsvib_torch.stacks.heap import share_one_heap
@@ -37,7 +38,7 @@ from rsvib_torch.stacks.run_folder import (
     run_to_file,
 )
 from rsvib_torch.video import Margins
-from rsvib_torch.video.video_frames import Frame, FrameTrack, RestoredFrame, VideoFrames
+from rsvib_torch.video.video_frames import Frame, FrameTrack, VideoFrames
 from rsvib_torch.video.video_passes import PART_FRAMES, VideoMotion, VideoPasses
 
 # A video that shakes more is refused: wrong settings make it 1.5 to 5 times as shaky. 0.1 px is not visible.
@@ -49,7 +50,8 @@ _JUDGED_FRAMES = 4  # of each part, two neighbouring ones of which are judged
 _OF_GYROSCOPE = ("orientation", "offset", "offset_std", "scale", "bias", "focal_length", "focal_length_std")
 
 Planes = list[Frame]
-_Restored = tuple[FrameTrack, RestoredFrame]
+# what was removed from a frame, and ``VideoFrames.restored`` of it; None if it cannot be read
+_Restored = tuple[FrameTrack, Planes | None, list[NDArray[np.bool_]] | None]
 
 
 @file_options(ProcessVideoOptions)
@@ -144,9 +146,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
             kept = margins.cut(torch.empty(content.shape[-2:], device="meta")).shape
             content = replace(content, shape=(*content.shape[:-2], *kept))
         check_info_target(sink, content, check_folder=False)
-        with closing(_restored_parts(video, motion, folder, at_once, progress)) as parts:
-            for part, frames, verdicts in parts:
-                _encode_part(video, motion, folder, part, frames, verdicts, content, margins, progress)
+        _SecondPass(video, motion, folder, content, margins, progress).run(at_once)
         _check_shaking(folder, is_explained=any(video.is_explained(motion, part) for part in range(video.parts)))
         gyroscope = None
         if isinstance(motion.path, RotationAlignment):
@@ -202,7 +202,7 @@ def _planned(
     with closing(open_stack(source)) as reader:
         stored = reader.picture if isinstance(reader, VideoReader) else None
     picture = stored if stored is not None and stored.fits(sink.suffix.lower()) else None
-    frames = VideoFrames(job, RestorationOptions(**given), picture, masks=options.border != "mirror")
+    frames = VideoFrames(job, picture, masks=options.border != "mirror")
     if job.info.shape[0] < 3:
         raise ValueError(
             f"{source}: to be followed, a video needs at least 3 frames, it has {job.info.shape[0]}; use process_stack "
@@ -223,93 +223,83 @@ def _planned(
     stated = None if exposures is None else exposures.tolist()
     profile, (height, width) = options.lens_profile, frames.size
     camera = None if profile is None else Camera.from_gyroflow(profile, width, height)
-    passes = VideoPasses(frames, starts.tolist(), options.steady, options.crop_limit, rates, camera, stated, stabilised)
-    return passes, at_once
+    return VideoPasses(frames, options, starts.tolist(), rates, camera, stated, stabilised), at_once
 
 
-def _restored_parts(
-    video: VideoPasses, motion: VideoMotion, folder: RunFolder, at_once: int, progress: Callable[[], None]
-) -> Generator[tuple[int, Iterator[_Restored], dict[int, RestorationVerdict | None]], None, None]:
-    """Number and restored frames of each part that is not in the folder, and the verdicts on the parts so far."""
-    verdicts: dict[int, RestorationVerdict | None] = {}
+@dataclass(frozen=True, eq=False)
+class _SecondPass:
+    """Restores the parts of a video that are not in the folder, and encodes them there."""
 
-    def missing() -> Generator[tuple[FrameTrack, Frame | str], None, None]:
+    video: VideoPasses
+    motion: VideoMotion
+    folder: RunFolder
+    info: StackInfo  # of the video to write
+    margins: Margins | None  # which are cut off
+    progress: Callable[[], None]
+    verdicts: dict[int, RestorationVerdict | None] = field(default_factory=dict)  # on the parts
+
+    def run(self, at_once: int) -> None:
+        """Restore a number of frames at the same time."""
+        share_one_heap()
+        threads = 1 if self.video.frames.job.device == "cpu" else torch.get_num_threads()
+        with closing(in_threads(self._restored, self._missing(), at_once=at_once, threads=threads)) as frames:
+            for part, of_part in groupby(frames, lambda one: one[0].index // PART_FRAMES):
+                self._encode(part, of_part)
+
+    def _missing(self) -> Generator[tuple[FrameTrack, Frame | str], None, None]:
+        """The frames to restore, with what is removed from them."""
+        video, motion = self.video, self.motion
         with closing(video.decoded()) as decoded:
             for part, frames in groupby(enumerate(decoded), lambda one: one[0] // PART_FRAMES):
-                if part in folder:
+                if part in self.folder:
                     for _ in frames:
-                        progress()
+                        self.progress()
                     continue
                 tracked = ((video.track(motion, index), frame) for index, frame in frames)
                 first = list(islice(tracked, _JUDGED_FRAMES))
-                verdicts[part] = verdict = video.verdict(motion, first)
+                verdict = video.verdict(motion, first)
                 # Parallax and overlays make two frames worse that shake less: corners decide.
-                is_doubted = not video.is_explained(motion, part) or (verdict and verdict.overall == "worse")
-                is_worse = bool(is_doubted) and video.shakes_more(motion, [track for track, _ in first])
-                if is_doubted and not is_worse:
-                    verdicts[part] = None
+                contradicts = verdict is not None and verdict.overall == "worse"
+                is_doubted = contradicts or not video.is_explained(motion, part)
+                is_worse = is_doubted and video.shakes_more(motion, [track for track, _ in first])
+                self.verdicts[part] = None if is_doubted and not is_worse else verdict
                 for track, frame in chain(first, tracked):
                     yield video.left_alone(track) if is_worse else track, frame
 
-    def restore(track: FrameTrack, frame: Frame | str) -> _Restored:
-        return track, video.frames.restored(frame, track)
+    def _restored(self, track: FrameTrack, frame: Frame | str) -> _Restored:
+        return (track, None, None) if isinstance(frame, str) else (track, *self.video.frames.restored(frame, track))
 
-    share_one_heap()
-    threads = 1 if video.frames.job.device == "cpu" else torch.get_num_threads()
-    with closing(in_threads(restore, missing(), at_once=at_once, threads=threads)) as frames:
-        for part, of_part in groupby(frames, lambda one: one[0].index // PART_FRAMES):
-            yield part, of_part, verdicts
-
-
-def _encode_part(
-    video: VideoPasses,
-    motion: VideoMotion,
-    folder: RunFolder,
-    part: int,
-    frames: Iterator[_Restored],
-    verdicts: dict[int, RestorationVerdict | None],
-    info: StackInfo,
-    margins: Margins | None,
-    progress: Callable[[], None],
-) -> None:
-    """Encode the frames of a part of a video to write, and enter it in the folder with the frame that it ends with.
-
-    The margins are cut off.
-    """
-    layout, name = video.frames, f"{part:06d}{folder.sink.suffix.lower()}"
-    tracks: list[FrameTrack] = []
-    before: Planes | None = None  # the frame before, without margins cut off
-    if part > 0:
-        with folder.open(f"{part - 1:06d}.npy") as file:
-            before = layout.planes(np.load(file, allow_pickle=False))
-    with ExitStack() as opened:
-        with disk_errors_named(folder):
-            encoded = part_of_video(folder.create(name), folder.sink, info, layout.picture)
-            write = opened.enter_context(encoded)
-        for track, restored in frames:
-            if tracks:
-                progress()  # the frame before is complete
-            before = _without_gaps(restored, before, layout)
+    def _encode(self, part: int, frames: Iterator[_Restored]) -> None:
+        """Encode the frames of a part, and enter it in the folder with the frame that it ends with."""
+        layout, folder = self.video.frames, self.folder
+        name = f"{part:06d}{folder.sink.suffix.lower()}"
+        tracks: list[FrameTrack] = []
+        before: Planes | None = None  # the frame before, without margins cut off
+        if part > 0:
+            with folder.open(f"{part - 1:06d}.npy") as file:
+                before = layout.planes(np.load(file, allow_pickle=False))
+        with ExitStack() as opened:
             with disk_errors_named(folder):
-                write(layout.frame(_cut(before, margins)))
-            tracks.append(track)
-        with disk_errors_named(folder):
-            opened.close()  # the file is complete
-    assert before is not None
-    record = video.record(part, tracks, motion, verdicts[part])
-    folder.add(record, [name], np.ascontiguousarray(layout.frame(before)))
-    progress()
-
-
-def _without_gaps(restored: RestoredFrame, before: Planes | None, layout: VideoFrames) -> Planes:
-    """Planes of a frame to write: those of the frame before where there are none, and at hidden pixels if they hold."""
-    planes = restored.planes
-    if planes is None or (restored.fault is not None and before is not None):
-        return layout.black() if before is None else before
-    if restored.visible is None or before is None:  # nothing is hidden, or it is mirrored
-        return planes
-    pairs = zip(restored.visible, planes, before, strict=True)
-    return [np.where(visible, plane, old) for visible, plane, old in pairs]
+                encoded = part_of_video(folder.create(name), folder.sink, self.info, layout.picture)
+                write = opened.enter_context(encoded)
+            for track, planes, visible in frames:
+                if tracks:
+                    self.progress()  # the frame before is complete
+                if planes is None or (track.fault is not None and before is not None):
+                    before = layout.black() if before is None else before
+                elif visible is None or before is None:  # nothing is hidden, or it is mirrored
+                    before = planes
+                else:  # hidden pixels are held
+                    before = [np.where(*one) for one in zip(visible, planes, before, strict=True)]
+                with disk_errors_named(folder):
+                    write(layout.frame(_cut(before, self.margins)))
+                tracks.append(track)
+            with disk_errors_named(folder):
+                opened.close()  # the file is complete
+        assert before is not None
+        record = self.video.record(part, tracks, self.motion, self.verdicts[part])
+        folder.add(record, [name], np.ascontiguousarray(layout.frame(before)))
+        self.progress()
 
 
 def _cut(planes: Planes, margins: Margins | None) -> Planes:

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, orientation_matrix
 from rsvib_torch.gyroscope.rotation_alignment import RotationAlignment
+from rsvib_torch.gyroscope.rotation_fit import image_components
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.numerics.tables import Array, table, tensor
@@ -63,5 +64,4 @@ class RecordedRotation:
 
     def _components(self, rotations: Rotation) -> Array:
         """(n, 3) X, Y (px) and roll (rad) of rotations, see ``Camera``."""
-        pitch, yaw, roll = rotations.as_rotvec().T
-        return np.stack([-self.camera.focal_length * yaw, self.camera.focal_length * pitch, -roll], -1)
+        return table(image_components(tensor(rotations.as_rotvec()), self.camera.focal_length))

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.execution.parallel import prefetched
+from rsvib_torch.io.full_scale import frames_to_counts
 from rsvib_torch.tracking import TrackedFrame, VibrationTracker
 from rsvib_torch.video import VideoBorder
 from rsvib_torch.video.frame_outputs import FrameOutput
@@ -179,6 +180,5 @@ def _tracked(
 
 def to_counts(frame: Tensor) -> NDArray[np.uint8]:
     """A frame (H, W) or (C, H, W) of full scale 1 as 8-bit counts (H, W) or (H, W, C)."""
-    counts = frame.nan_to_num(0.0).mul_(255.0).round_().clamp_(0.0, 255.0).to(torch.uint8)
-    counts = counts if frame.ndim == 2 else counts[0] if frame.shape[0] == 1 else counts.movedim(0, -1)
-    return counts.cpu().numpy()
+    counts = frames_to_counts(frame.nan_to_num(0.0), np.dtype(np.uint8), 255.0)
+    return counts if frame.ndim == 2 else counts[0] if len(counts) == 1 else np.moveaxis(counts, 0, -1)

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Literal, Protocol, get_args
+from typing import BinaryIO, Protocol, get_args
 
 import cv2
 import numpy as np
@@ -23,8 +23,8 @@ from rsvib_torch.checks.values import check_choice, check_whole_number
 from rsvib_torch.io import open_stack, read_stack_info, timing_from_first_frame
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array
+from rsvib_torch.options import PixelFormat
 
-PixelFormat = Literal["gray8", "gray16le", "rgb24", "bgr24"]
 _CHECK = 0.05  # s between checks whether the source has ended, or the session
 _LONGEST_READ = 2.0  # s that the end of a session waits for a frame of the source; OpenCV waits 30 s for a camera
 
@@ -134,12 +134,9 @@ class PipeSource:
         channels = 3 if self._format in ("rgb24", "bgr24") else 1
         count, index = height * width * channels * dtype.itemsize, 0
         while len(data := self._stream.read(count)) == count:
-            pixels = np.frombuffer(data, dtype)
-            if channels == 1:
-                pixels = pixels.reshape(height, width)
-            else:
-                colours = pixels.reshape(height, width, 3)
-                pixels = _channels_first(colours[..., ::-1] if self._format == "bgr24" else colours)
+            pixels = np.frombuffer(data, dtype).reshape(height, width, channels)
+            pixels = pixels[..., ::-1] if self._format == "bgr24" else pixels
+            pixels = _channels_first(pixels) if channels == 3 else pixels[..., 0]
             yield TimedFrame(pixels, index * self._period, time.perf_counter())
             index += 1
 

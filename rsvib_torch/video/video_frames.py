@@ -26,7 +26,6 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.numerics.splines import mirrored
 from rsvib_torch.numerics.tables import Array
-from rsvib_torch.options import RestorationOptions
 from rsvib_torch.restoration.restore import WITH_SATURATION, restore_prepared
 from rsvib_torch.stacks.job import StackJob
 from rsvib_torch.video import Margins
@@ -50,15 +49,6 @@ class FrameTrack:
 
 
 @dataclass(frozen=True, eq=False)
-class RestoredFrame:
-    """A restored frame."""
-
-    planes: list[Frame] | None  # those of the frame as taken if it could not be used, if there are any
-    visible: list[NDArray[np.bool_]] | None  # of each plane, the pixels (H, W) that the sensor recorded; None: all
-    fault: str | None = None  # why the frame could not be used
-
-
-@dataclass(frozen=True, eq=False)
 class VideoFrames:
     """How the frames of a video are stored, and how they are restored one by one.
 
@@ -67,9 +57,8 @@ class VideoFrames:
     """
 
     job: StackJob  # source and settings
-    options: RestorationOptions
     picture: Picture | None  # if frames are the planes Y, U and V of a 4:2:0 video (``VideoReader.planes``)
-    masks: bool  # whether ``RestoredFrame.visible`` is needed
+    masks: bool  # whether to determine which pixels the sensor recorded
 
     @property
     def planar(self) -> bool:
@@ -124,19 +113,20 @@ class VideoFrames:
             return margins
         return Margins(*(side + side % 2 for side in (margins.top, margins.bottom, margins.left, margins.right)))
 
-    def restored(self, frame: Frame | str, track: FrameTrack) -> RestoredFrame:
-        """Restore a frame as stored, or the reason why it cannot be read."""
-        if isinstance(frame, str):
-            return RestoredFrame(None, None, frame)
-        planes = self.planes(frame)
+    def restored(self, frame: Frame, track: FrameTrack) -> tuple[list[Frame], list[NDArray[np.bool_]] | None]:
+        """Planes of a restored frame, as taken if it could not be used, and of each the pixels (H, W) that are visible.
+
+        These are those that the sensor recorded; None: all, or they were not determined.
+        """
+        planes, method = self.planes(frame), self.job.chosen.method
         if track.fault is not None or not bool(track.motion.moving_axes().any()):
-            return RestoredFrame(planes, None, track.fault)
+            return planes, None
         results: list[Frame] = []
         visible: list[NDArray[np.bool_]] = []
         for number, plane in enumerate(planes):
             motion = track.motion if number == 0 else _on_half_pixels(track.motion)
             timing = self.timing_of(number, track.exposure)
-            separately = number == 0 and self.options.method != "dewarp"
+            separately = number == 0 and method != "dewarp"
             if separately and isinstance(motion, Vibration) and bool((motion.amplitude > 0).any()):
                 # The method undoes what varies between the rows along x and y, and the rest is moved afterwards.
                 rowwise = motion.translation()
@@ -156,7 +146,7 @@ class VideoFrames:
             if self.masks:
                 limits = np.array(plane.shape[:-3:-1], dtype=np.float32)[:, None, None] - 1
                 visible.append(np.all((source >= 0) & (source <= limits), axis=0))
-        return RestoredFrame(results, visible if self.masks else None)
+        return results, visible if self.masks else None
 
     def timing_of(self, plane: int, exposure: float | None = None) -> SensorTiming:
         """Timing of one frame, with the time origin in its middle; rows of chroma lie between two of luma."""
@@ -175,9 +165,9 @@ class VideoFrames:
         )
 
     def _without_vibration(self, plane: Frame, timing: SensorTiming, motion: Vibration) -> Frame:
-        scale = self.full_scale
+        scale, options = self.full_scale, self.job.chosen
         images: Tensor = counts_to_frames(plane[None], scale, "the video").to(self.job.device)
-        saturation = self.options.saturation if isinstance(self.options.saturation, float) else None
+        saturation = options.saturation if isinstance(options.saturation, float) else None
         if saturation is not None and self.picture is not None:
             black, white = self.picture.levels
             saturation = (black + saturation * (white - black)) / 255.0
@@ -185,7 +175,7 @@ class VideoFrames:
             saturation = None
         prepared = prepare_frames(images, timing, saturation=saturation, channels="first")
         with torch.no_grad():
-            restored = restore_prepared(prepared, motion, self.options)
+            restored = restore_prepared(prepared, motion, options)
         return frames_to_counts(prepared.from_row_order(restored)[0], plane.dtype, scale)
 
 

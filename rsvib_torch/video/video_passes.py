@@ -26,6 +26,7 @@ from rsvib_torch.motion.sampling import places_at_rest, recorded_offsets
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.numerics.tables import Array, tensor
+from rsvib_torch.options import ProcessVideoOptions
 from rsvib_torch.registration.corners import CornerFollower, Corners, reduction
 from rsvib_torch.restoration import RestorationVerdict
 from rsvib_torch.results.presentation import AXIS_NAMES
@@ -79,9 +80,8 @@ class VideoPasses:
     """What the passes through a video have in common: how frames are read, moved, judged and recorded."""
 
     frames: VideoFrames  # source, settings, and how frames are restored
+    options: ProcessVideoOptions
     starts: list[float]  # s, exposure start of every frame, from the first one
-    steady: float  # as in ``process_video``
-    crop_limit: float  # as in ``process_video``
     rates: AngularRates | None  # of a gyroscope, whose rotation is the path
     camera: Camera | None  # whose lens is known; None: its focal length is fitted
     exposures: list[float] | None  # s, of the frames; None: all that of the sensor
@@ -109,102 +109,40 @@ class VideoPasses:
         timing = self.frames.job.timing
         half = timing.time_to_middle(self.frames.size[int(timing.scan_axis)])
         times = np.array(self.starts) + half
-        taken = times.copy()  # of copies, when the frame before was taken
-        faults: dict[int, str] = {}
-        other: set[int] = set()  # frames that show something else than the frame before
-        checked: dict[int, Corners] = {}  # between the first frames of each part
-        compared: dict[int, Corners] = {}  # with a gyroscope, corners between some frames and the next ones
-
-        def pairs() -> Iterator[Corners | None]:
-            with closing(
-                prefetched(self._followed(taken, faults, other, checked, compared), WINDOW_FRAMES)
-            ) as frames:  # a window is fitted in this thread meanwhile
-                for corners in frames:
-                    progress()
-                    yield from corners
-
+        found = _FirstPass(self, times)
         if self.rates is None:
             with ONE_BLAS_THREAD:
-                path = camera_path(pairs(), timing, self.frames.size, has_tones=not self.stabilised)
-            places = path.places(taken)
-            cuts = [index for index in sorted(other) if not other & {index - 1, index + 1}]  # two in a row are a flash
-            shift = self._to_steady(times, lambda number, others: places[others] - places[number], cuts)
-            polynomials = np.stack([path.derivatives(taken, 1), path.derivatives(taken, 2), shift], 1)
+                path = camera_path(found.pairs(progress), timing, self.frames.size, has_tones=not self.stabilised)
+            places = path.places(found.taken)
+            shift = self._to_steady(times, lambda number, others: places[others] - places[number], found.cuts)
+            polynomials = np.stack([path.derivatives(found.taken, 1), path.derivatives(found.taken, 2), shift], 1)
             polynomials[:, :2] *= not self.stabilised
 
             def by_corners(index: int) -> Vibration:
-                return self._removed(path.tones(float(taken[index])), polynomials[index])
+                return self._removed(path.tones(float(found.taken[index])), polynomials[index])
 
-            return VideoMotion(path, taken, by_corners, faults, checked)
-        for _ in pairs():  # for ``compared``, and for ``checked``
+            return VideoMotion(path, found.taken, by_corners, found.faults, found.corners)
+        for _ in found.pairs(progress):  # for ``found.compared``, and for ``found.corners``
             pass
-        tracks = tracks_of_pairs(compared, self.starts, timing, self.frames.size)
-        starts = tensor(np.array([self.starts[index : index + 2] for index in compared]))
-        size, fitted = self.frames.size if timing.scan_axis == -2 else self.frames.size[::-1], self.camera is None
-        found = align_rates(tracks, starts, size, timing, self.rates, self.camera, fit_focal_length=fitted)
-        if not found.reliable:
-            raise ValueError(f"the gyroscope ({self.rates.source}) does not fit the video: {'; '.join(found.reasons)}")
-        rotation = RecordedRotation.aligned(self.rates, found, taken)
+        tracks = tracks_of_pairs(found.compared, self.starts, timing, self.frames.size)
+        aligned = align_rates(tracks, timing, self.rates, self.camera)
+        if not aligned.reliable:
+            source, reasons = self.rates.source, "; ".join(aligned.reasons)
+            raise ValueError(f"the gyroscope ({source}) does not fit the video: {reasons}")
+        rotation = RecordedRotation.aligned(self.rates, aligned, found.taken)
         turned = self._to_steady(times, rotation.apart)
-        return VideoMotion(found, taken, lambda index: rotation.motion(index, turned[index], half), faults, checked)
 
-    def _followed(
-        self,
-        taken: Array,
-        faults: dict[int, str],
-        other: set[int],
-        checked: dict[int, Corners],
-        compared: dict[int, Corners],
-    ) -> Generator[tuple[Corners | None, ...], None, None]:
-        """Of every frame, the corners between it and the usable frame before, if there is one; fills the tables.
+        def by_gyroscope(index: int) -> FreeMotion:
+            return rotation.motion(index, turned[index], half)
 
-        Copies do not count. In the times when frames were ``taken`` (N,) in s, they have that of the frame before.
-        """
-        chosen = compared_pairs(len(self.starts)) if self.rates is not None else ()
-        before: tuple[int, NDArray[np.uint8]] | None = None
-        changes: deque[float] = deque(maxlen=_MEMORY)  # counts, of the frames before
-        follower = CornerFollower(self.frames.job.timing)
-        with closing(self.decoded()) as frames:
-            for index, frame in enumerate(frames):
-                if isinstance(frame, str):
-                    faults[index] = frame
-                    yield ()
-                    continue
-                grey = self.frames.grey(frame)
-                changed = math.inf if before is None else cv2.norm(grey, before[1], cv2.NORM_L1) / grey.size
-                usual = float(np.median(changes)) if len(changes) >= _MEMORY // 2 else 0.0
-                if before is not None and changed <= _COPY * usual:
-                    taken[index] = taken[before[0]]
-                    yield ()
-                    continue
-                if grey.min() == grey.max():
-                    faults[index] = f"frame {index} is constant"
-                    yield ()
-                    continue
-                if before is not None:
-                    changes.append(changed)
-                corners = follower.next(grey, self.starts[index])
-                if before is not None:
-                    if (corners is None or len(corners.rows) < _FEW) and _shows_other(grey, before[1]):
-                        corners = None
-                        other.add(index)
-                    if corners is not None and before[0] == index - 1 and index % PART_FRAMES < _CHECKED_FRAMES:
-                        checked[index - 1] = corners
-                    if before[0] == index - 1 in chosen:
-                        starts = self.starts[index - 1 : index + 1]
-                        compared[index - 1] = followed_pair(before[1], grey, starts, self.frames.job.timing)
-                    if corners is not None and self.stabilised:
-                        both = np.broadcast_to(taken[[before[0], index]], corners.times.shape)
-                        corners = replace(corners, times=both)
-                yield () if before is None else (corners,)
-                before = index, grey
+        return VideoMotion(aligned, found.taken, by_gyroscope, found.faults, found.corners)
 
     def _to_steady(self, times: Array, apart: Callable[[int, slice], Array], cuts: Sequence[int] = ()) -> Array:
-        return steady_shifts(times, apart, self.steady, self.frames.size, self.crop_limit, cuts)
+        return steady_shifts(times, apart, self.options.steady, self.frames.size, self.options.crop_limit, cuts)
 
     def _removed(self, tones: list[Tone], polynomial: Array) -> Vibration:
         """The tones, skew and wobble by the path, and what the path is not smooth by."""
-        if self.steady == 0:  # axes without vibration stay as taken
+        if self.options.steady == 0:  # axes without vibration stay as taken
             polynomial = polynomial * np.array([any(tone.axis == axis for tone in tones) for axis in range(4)])
         height, width = self.frames.size
         seconds = 0.5 * self.frames.job.timing.row_time * max(height, width)
@@ -302,7 +240,7 @@ class VideoPasses:
         both = replace(
             undone, image_motion=mean - 0.5 * change, image_acceleration=change / interval, image_shift=0.0 * mean
         )
-        return pair_verdict(images, self.frames.job.timing, both, interval, self.frames.options)
+        return pair_verdict(images, self.frames.job.timing, both, interval, self.frames.job.chosen)
 
     def record(
         self,
@@ -315,7 +253,7 @@ class VideoPasses:
         path = motion.path
         detection = self._detection(path, motion, tracks) if isinstance(path, CameraPath) else None
         left = []
-        if detection is not None and self.steady == 0:  # the rows of axes without tones are not moved
+        if detection is not None and self.options.steady == 0:  # the rows of axes without tones are not moved
             left = [
                 Reason("axis_not_reliable", name, details={"action": "restored", "why": "; ".join(map(str, why))})
                 for name, why, sizes in zip(
@@ -431,6 +369,75 @@ class VideoPasses:
                 against.append(Reason("tone_averaged_out", name, fastest, 1 / timing.exposure_time))
             findings.append(tuple(against))
         return tuple(findings)
+
+
+class _FirstPass:
+    """Follows corners from each usable frame of a video to the next one; copies of the frame before do not count."""
+
+    def __init__(self, video: VideoPasses, times: Array) -> None:
+        """A pass through a video, the middles of whose frames are at ``times`` (N,) in s."""
+        self._video, self._timing = video, video.frames.job.timing
+        self.taken = times.copy()  # of copies, when the frame before was taken
+        self.faults: dict[int, str] = {}  # number of each frame that cannot be used, with the reason
+        self.corners: dict[int, Corners] = {}  # between a frame and the next one, of the first frames of each part
+        self.compared: dict[int, Corners] = {}  # with a gyroscope, likewise, of some frames of the video
+        self._chosen = compared_pairs(len(times)) if video.rates is not None else []
+        self._others: set[int] = set()  # frames that show something else than the frame before
+        self._before: tuple[int, NDArray[np.uint8]] | None = None  # the usable frame before, and its number
+        self._changes: deque[float] = deque(maxlen=_MEMORY)  # counts, of the frames before
+        self._follower = CornerFollower(self._timing)
+
+    @property
+    def cuts(self) -> list[int]:
+        """Numbers of the first frames of further shots; two other frames in a row are a flash."""
+        return [index for index in sorted(self._others) if not self._others & {index - 1, index + 1}]
+
+    def pairs(self, progress: Callable[[], None]) -> Iterator[Corners | None]:
+        """Corners between each usable frame and the one before; a thread follows them, up to a window ahead."""
+        with closing(prefetched(self._followed(), WINDOW_FRAMES)) as frames:
+            for corners in frames:
+                progress()
+                yield from corners
+
+    def _followed(self) -> Generator[tuple[Corners | None, ...], None, None]:
+        with closing(self._video.decoded()) as frames:
+            for index, frame in enumerate(frames):
+                yield self._next(index, frame)
+
+    def _next(self, index: int, frame: Frame | str) -> tuple[Corners | None, ...]:
+        """The corners between a frame and the usable frame before, if it is usable and there is one."""
+        # 1. Faults and copies.
+        if isinstance(frame, str):
+            self.faults[index] = frame
+            return ()
+        grey, before = self._video.frames.grey(frame), self._before
+        changed = math.inf if before is None else cv2.norm(grey, before[1], cv2.NORM_L1) / grey.size
+        usual = float(np.median(self._changes)) if len(self._changes) >= _MEMORY // 2 else 0.0
+        if before is not None and changed <= _COPY * usual:
+            self.taken[index] = self.taken[before[0]]
+            return ()
+        if grey.min() == grey.max():
+            self.faults[index] = f"frame {index} is constant"
+            return ()
+        # 2. Corners.
+        corners = self._follower.next(grey, self._video.starts[index])
+        self._before = index, grey
+        if before is None:
+            return ()
+        self._changes.append(changed)
+        if (corners is None or len(corners.rows) < _FEW) and _shows_other(grey, before[1]):
+            corners = None
+            self._others.add(index)
+        if before[0] == index - 1:
+            if corners is not None and index % PART_FRAMES < _CHECKED_FRAMES:
+                self.corners[index - 1] = corners
+            if index - 1 in self._chosen:
+                starts = self._video.starts[index - 1 : index + 1]
+                self.compared[index - 1] = followed_pair(before[1], grey, starts, self._timing)
+        if corners is not None and self._video.stabilised:
+            both = np.broadcast_to(self.taken[[before[0], index]], corners.times.shape)
+            corners = replace(corners, times=both)
+        return (corners,)
 
 
 def tone_tables(tones: list[Tone], axes: int) -> Array:

@@ -15,19 +15,12 @@ def lines_of(times, rates):
     return [",".join(f"{value:.10g}" for value in (time, *row)) for time, row in zip(times, rates, strict=True)]
 
 
-def gcsv(path, *, orientation="XYZ", header=(), columns="t,gx,gy,gz,ax,ay,az", rows=None):
+def gcsv(path, *, orientation="XYZ", columns="t,gx,gy,gz,ax,ay,az", rows=None):
     """A gyroflow log with times in ms and rates in units of 0.5 mrad/s."""
     raw = np.round(RATES / 5e-4).astype(int)
     rows = [f"{5 * i},{x},{y},{z},0,0,1" for i, (x, y, z) in enumerate(raw)] if rows is None else rows
-    start = [
-        "GYROFLOW IMU LOG",
-        "version,1.3",
-        "id,test",
-        f"orientation,{orientation}",
-        "tscale,0.001",
-        "gscale,0.0005",
-    ]
-    path.write_text("\n".join([*start, *header, columns, *rows]) + "\n")
+    start = ["GYROFLOW IMU LOG", "version,1.3", "id,test", f"orientation,{orientation}"]
+    path.write_text("\n".join([*start, "tscale,0.001", "gscale,0.0005", columns, *rows]) + "\n")
     return path
 
 

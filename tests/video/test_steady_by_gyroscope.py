@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 import torch
-from gpmf_file import add_track, packet
+from gpmf_file import add_track, packet, write_rates
 from rotating_camera import FOCAL_LENGTH, OFFSET, TIMING, recorded, take
 from scipy.spatial.transform import Rotation
 from skimage.registration import phase_cross_correlation
@@ -45,11 +45,6 @@ def write_clip(path, frames):
     counts = np.repeat(np.clip(np.round(255 * frames.numpy()), 0, 255).astype(np.uint8)[..., None], 3, -1)
     encoder = {"codec": "libx264", "encoded": "yuv420p", "options": {"crf": "6", "threads": "1"}, "sound": "aac"}
     write_video(path, counts, np.arange(len(counts)) * TIMING.frame_period, layout="rgb24", rate=30, **encoder)
-
-
-def write_rates(path, rates):
-    rows = [",".join(f"{value:.9g}" for value in row) for row in torch.cat([rates.times[:, None], rates.rates], 1)]
-    path.write_text("time_s,gx_rad_s,gy_rad_s,gz_rad_s\n" + "\n".join(rows))
 
 
 def shaking(path):
