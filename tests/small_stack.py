@@ -65,5 +65,15 @@ def write_with_gaps(folder, kept, start=0.0):
     return times
 
 
+def stop_after(frames):
+    """A function of the progress of a run that interrupts it."""
+
+    def stop(done, total):
+        if done > frames:
+            raise KeyboardInterrupt
+
+    return stop
+
+
 def process_small(source, sink, **options):
     return process_stack(source, sink, TIMING, full_scale=4095, **{**OPTIONS, **options})

@@ -94,24 +94,16 @@ def grey_frames(
         # single pixels are interpolated: the rows of a frame without one pixel in twenty could not be registered
         around = torch.nn.functional.avg_pool2d(valid.to(images.dtype), 3, 1, 1)
         valid = _unless_complete(valid | (around > _MEASURED_AROUND))
-    # a frame without detail has no displacement; every 16th row is enough to find that a frame is not constant
-    constant = _constant(images[..., ::16, :])
-    if bool(constant.any()):
-        constant = _constant(images)
-        if bool(constant.any()):
-            stack, frame = constant.nonzero()[0].tolist()
-            raise ValueError(constant_frame(f"{frame}{of_stack(stack)}"))
+    # a frame without detail has no displacement
+    for stack, frame in _constant(images).nonzero().tolist():
+        raise ValueError(constant_frame(f"{frame}{of_stack(stack)}"))
     # a copy of a frame was exposed at another time than its place in the stack states
-    repeated = _repeated(images[..., ::16, :])
-    if bool(repeated.any()):
-        repeated = _repeated(images)
-        if bool(repeated.any()):
-            stack, first = repeated.nonzero()[0].tolist()
-            raise ValueError(
-                f"frames {first} and {first + 1}{of_stack(stack)} are identical: one of them is a copy (video "
-                "converters repeat frames), and its time is wrong; remove copies and state the times of the others in "
-                "frame_start_times"
-            )
+    for stack, first in _repeated(images).nonzero().tolist():
+        raise ValueError(
+            f"frames {first} and {first + 1}{of_stack(stack)} are identical: one of them is a copy (video converters "
+            "repeat frames), and its time is wrong; remove copies and state the times of the others in "
+            "frame_start_times"
+        )
     # all channels show the same displacement; the pattern of a colour mosaic does not move with the scene
     images = images.mean(2) if images.shape[2] > 1 else without_mosaic(images[:, :, 0])
     return GreyFrames(images, valid, prepared.batched, prepared.image_timing)

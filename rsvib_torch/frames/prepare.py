@@ -105,21 +105,8 @@ def prepare_frames(
 ) -> PreparedFrames:
     """Read and check frames; turn them into floating-point images (B, T, C, H, W) in row order, with their masks.
 
-    Args:
-        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) in image orientation; tensor, array, list of these, a
-            path or a list of paths.
-        timing: The sensor. The frame times of a file that is given by its path are used.
-        full_scale: Count that means 1.0, for integer frames other than uint8; by default that of the file.
-        channels: As in ``channel_axis``.
-        ignore: Boolean mask of the frames' shape, or one that broadcasts to that shape without the channel axis: True
-            at pixels without data, which may hold any value. None for no mask; NaN marks missing pixels as well.
-        saturation: Level from which pixels are saturated, in the unit of the frames; ``"auto"``: full scale for
-            integer frames, none for floating-point frames, whose level is unknown; None for none.
-        minimum_frames: Number of frames that the stack must have.
-        allow_missing: Whether NaN marks missing pixels; if not, NaN is refused.
-        mosaic: Colours of the pixels (0, 0), (0, 1), (1, 0), (1, 1) of raw frames, e.g. ``"RGGB"``; None for frames
-            whose pixels measure all channels.
-        name: Name of the argument in error messages.
+    ``full_scale``, ``channels``, ``ignore``, ``saturation`` and ``mosaic`` are as in ``MaskedInputOptions`` and
+    ``RestorationOptions``. Without ``allow_missing`` NaN is refused. Errors contain the ``name`` of the argument.
 
     Example:
         >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512, scan_axis="x")

@@ -118,35 +118,22 @@ def _info(
     return replace(info, metadata=_metadata(tif, info))
 
 
-def _axes_of(series: tifffile.TiffPageSeries) -> tuple[str, tuple[int, ...]]:
-    """Axes of a series and their sizes, those of length 1 included."""
-    if hasattr(series, "get_axes"):  # before tifffile 2026.5.2
-        return series.get_axes(squeeze=False), series.get_shape(squeeze=False)
-    return series.axes, series.shape
-
-
 def _page_reader(
     path: Path,
     info: StackInfo,
     pages: Sequence[tifffile.TiffPage | tifffile.TiffFrame | None],
     of_frames: Sequence[Sequence[int]],
-    shape: tuple[int, ...],
-    order: tuple[int, ...],
     close: Callable[[], None],
 ) -> BlockReader:
-    """Reader of the frames that consist of the ``pages`` with the numbers ``of_frames``.
-
-    The pages of a frame have together a ``shape``, whose axes ``order`` permutes to (..., H, W) or (..., C, H, W) with
-    leading axes of length 1.
-    """
+    """Reader of the frames that consist of the ``pages`` with the numbers ``of_frames``, one or one of each channel."""
     size = path.stat().st_size
 
     def read(first: int, _: int) -> Array:
         of_frame = [pages[number] for number in of_frames[first]]
         if not all(_is_complete(page, size) for page in of_frame):
             raise FrameError(f"{path}: truncated: pixels of frame {first} lie beyond the end of the file")
-        stored = np.stack([page.asarray(maxworkers=1) for page in of_frame if page is not None]).reshape(shape)
-        return stored.transpose(order).reshape(1, *info.shape[1:])
+        stored = np.stack([page.asarray(maxworkers=1) for page in of_frame if page is not None])
+        return (np.moveaxis(stored, -1, 1) if info.channels_last else stored).reshape(1, *info.shape[1:])
 
     return BlockReader(path, info, read, close=close)
 
@@ -166,44 +153,36 @@ def _open_pages(path: Path, tif: tifffile.TiffFile, pages: Sequence[_Page]) -> B
     info = _info(tif, (len(frames), *shape), first.dtype, first.photometric, channels_last=last)
     lost = {"thumbnails and masks": None} if len(frames) < len(pages) else {}
     info = replace(info, metadata={**info.metadata, **lost})
-    order = (2, 0, 1) if last else tuple(range(len(shape)))
-    return _page_reader(path, info, tif.pages, [[page.number] for page in frames], first.shape, order, tif.close)
+    return _page_reader(path, info, tif.pages, [[page.number] for page in frames], tif.close)
 
 
 def _open_series(path: Path, tif: tifffile.TiffFile) -> BlockReader:
     """Reader of a file whose pages are arranged as one array."""
-    # with axes of length 1, which is an option from tifffile 2026.5.2 on
-    series = (tif.series(squeeze=False) if callable(tif.series) else tif.series)[0]
-    # 1. The stack, and the permutation of the stored axes into (ones, T, C, H, W).
-    axes, shape = _axes_of(series)
-    rows, columns = axes.index("Y"), axes.index("X")
-    channels = [i for i, axis in enumerate(axes) if axis in "SC" and shape[i] > 1]
-    times = [i for i in range(len(axes)) if i not in (rows, columns, *channels) and shape[i] > 1]
-    if len(channels) > 1 or len(times) > 1:
-        raise ValueError(f"axes {axes} of sizes {tuple(shape)}; expected one axis of frames and one of channels")
-    kept = (*times, *channels, rows, columns)
-    order = (*(i for i in range(len(axes)) if i not in kept), *kept)
-    stack = tuple(shape[i] for i in kept)
-    last = bool(channels) and channels[0] > columns
-    stack = stack if times else (1, *stack)
+    series = (tif.series() if callable(tif.series) else tif.series)[0]  # a method from tifffile 2026.5.2 on
+    # 1. The stack: an axis of frames, one of channels, and the image; axes of length 1 mean nothing.
+    sizes = [(axis, size) for axis, size in zip(series.axes, series.shape, strict=True) if size > 1 or axis in "YX"]
+    axes, shape = "".join(axis for axis, _ in sizes), tuple(size for _, size in sizes)
+    channels = [place for place, axis in enumerate(axes) if axis in "SC"]
+    times = [place for place, axis in enumerate(axes) if axis not in "SCYX"]
+    last = axes.endswith(("YXS", "YXC"))
+    if len(channels) > 1 or len(times) > 1 or "YX" not in axes:
+        raise ValueError(f"axes {axes} of sizes {shape}; expected one axis of frames, one of channels, and YX")
+    order = [*times, *channels, axes.index("Y"), axes.index("X")]
+    stack = tuple(shape[place] for place in order) if times else (1, *(shape[place] for place in order))
     info = _info(tif, stack, series.dtype, series.keyframe.photometric, channels_last=last)
     # 2. Its frames: one after another, or in pages.
     pages, T = series.pages, info.shape[0]
-    in_order = tuple(sorted(order))
-    frame_by_frame = order == in_order or (info.channels_last and (*order[:-3], *order[-2:], order[-3]) == in_order)
-    if series.dataoffset is not None and frame_by_frame:
+    if series.dataoffset is not None and (order == sorted(order) or (last and times in ([], [0]))):
         tif.close()
         return contiguous_reader(path, info, series.dataoffset, series.dtype.newbyteorder(tif.byteorder))
     size = path.stat().st_size
     _check_complete([_is_complete(page, size) for page in pages], math.prod(shape) * series.dtype.itemsize, size)
-    time = times[0] if times else 0
-    of_pages = next(i for i in range(len(shape) + 1) if math.prod(shape[:i]) == len(pages))  # axes with one page each
-    if T > 1 and time >= of_pages:
+    over_pages = shape[: len(shape) - len(series.keyframe.shape)]
+    if math.prod(over_pages) != len(pages) or (times and times[0] >= len(over_pages)):
         raise ValueError(f"axes {axes}: a page has several frames; expected one frame per page")
-    numbers = np.arange(len(pages)).reshape(*shape[:of_pages], *[1] * (len(shape) - of_pages))
-    of_frames = np.moveaxis(numbers, time, 0).reshape(T, -1).tolist()
-    frame_shape = tuple(1 if T > 1 and i == time else size for i, size in enumerate(shape))
-    return _page_reader(path, info, pages, of_frames, frame_shape, order, tif.close)
+    numbers = np.arange(len(pages)).reshape(over_pages)
+    of_frames = (np.moveaxis(numbers, times[0], 0) if times else numbers).reshape(T, -1).tolist()
+    return _page_reader(path, info, pages, of_frames, tif.close)
 
 
 def _check_one_page_per_frame(shape: tuple[int, ...], axes: str, pages: int) -> None:

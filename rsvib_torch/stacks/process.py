@@ -175,7 +175,6 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
         options,
         manifest_header(job, sink.name, compression),
         inputs=stack_files(source),
-        windows=len(windows),
         compute=compute,
         write=write,
     )

@@ -356,7 +356,6 @@ def run_to_file(
     header: Table,
     *,
     inputs: Iterable[Path],
-    windows: int,
     compute: Callable[[RunFolder], Table],
     write: Callable[[RunFolder], None],
 ) -> StackReport:
@@ -373,7 +372,7 @@ def run_to_file(
         records = manifest.windows
         return StackReport(
             frames=sum(record.written for record in records),
-            windows=windows,
+            windows=len(records),
             restored=sum(record.frames == "restored" for record in records),
             failed=sum(record.error is not None for record in records),
             bad_frames=len(manifest.bad_frames),
@@ -391,7 +390,7 @@ def run_to_file(
             raise ValueError(f"{sink}: cannot resume: {difference}; omit resume to replace the output")
         for written in (sink, path):
             atomic.remove_abandoned(written)
-        return report(complete, windows)
+        return report(complete, len(complete.windows))
     folder = RunFolder(sink, header, resume=options.resume)
     try:
         resumed = folder.count

@@ -163,7 +163,6 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         options,
         header,
         inputs=[*stack_files(source), *(Path(file) for file in (recording, options.lens_profile) if file is not None)],
-        windows=video.parts,
         compute=compute,
         write=write,
     )

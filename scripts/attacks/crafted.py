@@ -103,6 +103,8 @@ CASES["raw: sidecar of 2 GB"] = lambda folder: (_raw(folder), _sparse("a.raw.jso
 
 # --- PNG and JPEG -------------------------------------------------------------------------------------------------
 
+_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
 
 def _chunk(kind: bytes, body: bytes, length: int | None = None) -> bytes:
     size = len(body) if length is None else length
@@ -113,13 +115,17 @@ def _png(width: int, height: int, bits: int = 8, colour: int = 0, pixels: int = 
     head = _chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0))
     packer = zlib.compressobj(9)
     packed = b"".join(packer.compress(bytes(min(10**7, pixels - done))) for done in range(0, pixels, 10**7))
-    return b"\x89PNG\r\n\x1a\n" + head + more + _chunk(b"IDAT", packed + packer.flush()) + _chunk(b"IEND", b"")
+    return _SIGNATURE + head + more + _chunk(b"IDAT", packed + packer.flush()) + _chunk(b"IEND", b"")
 
 
 for _width, _height in ((2**31 - 1, 2**31 - 1), (1, 2**31 - 1), (10**6, 10**6), (0, 0)):
     for _bits, _colour in ((8, 0), (16, 6)):
         _named = f"PNG: {_width} x {_height} px, {_bits} bits, colour type {_colour}"
         _case_of(_named, _png(_width, _height, _bits, _colour))
+# Pillow searches a file of any size for its header, at 20 MB/s
+CASES["PNG: sparse file of 6 GB"] = partial(_sparse, "a.png", _SIGNATURE, 6 << 30)
+CASES["PNG: sparse text of 6 GB"] = partial(_sparse, "a.png", _SIGNATURE + b"\x40\0\0\0tEXt", 6 << 30)
+CASES["JPEG: sparse file of 6 GB"] = partial(_sparse, "a.jpg", b"\xff\xd8\xff\xe0", 6 << 30)
 CASES["PNG: 30000 x 30000 px in 1 MB"] = lambda folder: _data("a.png", _png(30000, 30000, pixels=30001 * 30000), folder)
 
 

@@ -77,8 +77,8 @@ def test_channels_last_in_chunks_of_several_frames(tmp_path):
     reader.close()
 
 
-@pytest.mark.parametrize(("axes", "compression"), [("CTYX", None), ("TXY", "zlib"), ("CTXY", "zlib")])
-def test_pages_and_axes_in_any_order(tmp_path, axes, compression):
+@pytest.mark.parametrize(("axes", "compression"), [("CTYX", None), ("CTYX", "zlib"), ("TYX", "zlib")])
+def test_pages_in_any_order(tmp_path, axes, compression):
     counts, names = (COLOUR, "TCYX") if "C" in axes else (COUNTS, "TYX")
     write_tiff(tmp_path / "a.tif", axes, counts, names, bigtiff=True, byteorder=">", compression=compression)
     np.save(tmp_path / "a.npy", np.asfortranarray(counts))
@@ -89,10 +89,12 @@ def test_pages_and_axes_in_any_order(tmp_path, axes, compression):
         reader.close()
 
 
-@pytest.mark.parametrize("axes", ["YXT", "YTX"])
-def test_pages_with_several_frames_are_refused(tmp_path, axes):
+@pytest.mark.parametrize(
+    ("axes", "expected"), [("YXT", "one frame per page"), ("YTX", "one axis of frames"), ("TXY", "one axis of frames")]
+)
+def test_pages_of_other_axes_than_the_image_are_refused(tmp_path, axes, expected):
     write_tiff(tmp_path / "a.tif", axes)
-    refuses(lambda: open_stack(tmp_path / "a.tif"), "expected one frame per page")
+    refuses(lambda: open_stack(tmp_path / "a.tif"), f"expected {expected}")
 
 
 def test_damaged_block_is_an_error_of_its_frames(tmp_path):

@@ -44,23 +44,17 @@ def test_tiff_truncated_anywhere_is_refused(tmp_path, kind):
         assert "\n" not in str(caught.value)
 
 
-def test_tiff_files_that_are_not_stacks_are_refused(tmp_path):
-    with tifffile.TiffWriter(tmp_path / "sizes.tif") as tif:
-        tif.write(np.zeros((9, 7), "uint8"), metadata=None)
-        tif.write(np.zeros((5, 7), "uint8"), metadata=None)
-    tifffile.imwrite(tmp_path / "white.tif", np.zeros((9, 7), "uint8"), photometric="miniswhite")
-    tifffile.imwrite(tmp_path / "bits.tif", np.zeros((9, 8), bool), photometric="minisblack")
-    tifffile.imwrite(
-        tmp_path / "axes.tif", np.zeros((2, 5, 9, 7), "uint8"), photometric="minisblack", metadata={"axes": "TZYX"}
-    )
-    for name, message in {
-        "sizes": r"different size or kind: page 1 is 5 x 7 px uint8, page 0 is 9 x 7 px uint8",
-        "white": "MINISWHITE",
-        "bits": "pixels are bool",
-        "axes": "one axis of frames",
-    }.items():
-        with pytest.raises(ValueError, match=message):
-            read_stack(tmp_path / f"{name}.tif")
+@pytest.mark.parametrize(
+    ("shape", "dtype", "options", "message"),
+    [
+        ((9, 7), "uint8", {"photometric": "miniswhite"}, "MINISWHITE"),
+        ((9, 8), "bool", {}, "pixels are bool"),
+        ((2, 5, 9, 7), "uint8", {"metadata": {"axes": "TZYX"}}, "one axis of frames"),
+    ],
+)
+def test_tiff_files_that_are_not_stacks_are_refused(tmp_path, shape, dtype, options, message):
+    tifffile.imwrite(tmp_path / "a.tif", np.zeros(shape, dtype), **{"photometric": "minisblack"} | options)
+    refuses(lambda: read_stack(tmp_path / "a.tif"), message)
 
 
 def test_png_damage_is_refused(tmp_path):

@@ -1,4 +1,4 @@
-"""The registry of formats: round trips, files of other programs, refused files, additional formats."""
+"""Stacks in files of all formats: round trips with full scale, files of other programs, additional formats."""
 
 import sys
 
@@ -26,30 +26,107 @@ COUNTS = np.random.default_rng(8).integers(0, 4096, (3, 9, 7)).astype(np.uint16)
 COUNTS.flat[0] = 4095
 
 
-@pytest.mark.parametrize("ending", [".h5", ".zarr", ".raw"])
-@pytest.mark.parametrize(("shape", "dtype"), [((3, 9, 7), "uint8"), ((2, 3, 9, 7), "int32"), ((1, 5, 9, 7), "float64")])
-def test_stacks_are_read_as_written(tmp_path, ending, shape, dtype):
-    path = tmp_path / f"frames{ending}"
-    stored = np.random.default_rng(3).integers(0, 256, shape) / 255
-    scale = None if "float" in dtype else 255
+STACKS = [
+    ((1, 9, 7), "uint8", 255),
+    ((3, 9, 7), "uint16", 4095),
+    ((2, 3, 9, 7), "uint8", 63),
+    ((2, 4, 9, 7), "uint16", 65535),
+    ((1, 3, 9, 7), "uint16", 1000),
+]
+OTHERS = [((2, 2, 9, 7), "int16", 4095), ((2, 5, 9, 7), "uint32", 100000)]  # which PNG files do not hold
+
+
+def pixels_of_images(folder):
+    pixels = np.stack([cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in sorted(folder.iterdir())])
+    return pixels if pixels.ndim == 3 else pixels[..., [2, 1, 0, 3][: pixels.shape[-1]]]
+
+
+def values_in_hdf5(path):
+    with h5py.File(path) as file:
+        assert "full_scale" in file["frames"].attrs
+        return file["frames"][:]
+
+
+def values_in_zarr(path):
+    array = zarr.open_group(path, mode="r", zarr_format=3)["frames"]
+    assert array.metadata.dimension_names == ("frame", *["channel"][: array.ndim - 3], "y", "x")
+    return array[:]
+
+
+# pixels by other libraries
+READERS = {
+    "frames": pixels_of_images,
+    "a.tif": tifffile.imread,
+    "a.h5": values_in_hdf5,
+    "a.zarr": values_in_zarr,
+    "a.raw": lambda path: np.fromfile(path, read_stack_info(path).dtype),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "dtype", "largest"),
+    [(name, *stack) for name in READERS for stack in STACKS + OTHERS * (name != "frames")],
+)
+def test_stacks_are_read_as_written_also_by_other_libraries(tmp_path, name, shape, dtype, largest):
+    stored = np.random.default_rng(3).integers(0, largest + 1, shape).astype(dtype)
+    stored.flat[:2] = 0, largest
+    path = tmp_path / name
     for _ in range(2):  # the second call replaces the file of the first
-        write_stack(path, torch.from_numpy(stored), dtype=dtype, full_scale=scale)
-    assert read_stack_info(path) == StackInfo(shape, dtype, scale)
-    np.testing.assert_allclose(read_stack(path).numpy(), stored, rtol=1e-6, atol=1e-7)
-    assert {item.name for item in tmp_path.iterdir()} <= {path.name, "frames.raw.json"}
+        write_stack(path, torch.from_numpy(stored / largest), dtype=dtype, full_scale=largest)
+    assert read_stack_info(path) == StackInfo(shape, dtype, float(largest))
+    frames = read_stack(path)
+    assert (frames.dtype, frames.shape) == (torch.float32, shape)
+    np.testing.assert_allclose(frames.numpy(), stored / largest, rtol=1e-7)
+    found = READERS[name](path)
+    assert found.dtype == dtype
+    last = len(shape) == 4 and shape[1] in (3, 4) and name in ("frames", "a.tif")
+    np.testing.assert_array_equal((np.moveaxis(found, -1, -3) if last else found).reshape(shape), stored)
+    assert {item.name for item in tmp_path.iterdir()} <= {name, "a.raw.json"}
+    if name == "frames":
+        assert sorted(item.name for item in path.iterdir()) == [f"frame_{i:04d}.png" for i in range(shape[0])]
+    write_stack(path, frames, dtype=dtype, full_scale=largest)  # the same counts again
+    np.testing.assert_array_equal(READERS[name](path), found)
 
 
-def test_files_can_be_read_by_other_libraries(tmp_path):
-    frames = torch.from_numpy(COUNTS / 4095.0)
-    for name in ("a.h5", "a.zarr", "a.raw"):
-        write_stack(tmp_path / name, frames, dtype="uint16", full_scale=4095)
-    with h5py.File(tmp_path / "a.h5") as file:
-        np.testing.assert_array_equal(file["frames"][:], COUNTS)
-        assert file["frames"].attrs["full_scale"] == 4095
-    array = zarr.open_group(tmp_path / "a.zarr", mode="r", zarr_format=3)["frames"]
-    np.testing.assert_array_equal(array[:], COUNTS)
-    assert array.metadata.dimension_names == ("frame", "y", "x")
-    np.testing.assert_array_equal(np.fromfile(tmp_path / "a.raw", "<u2").reshape(3, 9, 7), COUNTS)
+def test_npy_and_single_png(tmp_path):
+    stored, frames = COUNTS[:2], torch.from_numpy(COUNTS[:2] / 4095)
+    write_stack(tmp_path / "frames.npy", frames, dtype="uint16", full_scale=4095)
+    np.testing.assert_array_equal(np.load(tmp_path / "frames.npy"), stored)
+    assert read_stack_info(tmp_path / "frames.npy") == StackInfo((2, 9, 7), "uint16", None)
+    torch.testing.assert_close(read_stack(tmp_path / "frames.npy", full_scale=4095), frames.float())
+    np.save(tmp_path / "image.npy", stored[0])
+    assert read_stack(tmp_path / "image.npy", full_scale=4095).shape == (1, 9, 7)
+    write_stack(tmp_path / "one.PNG", frames[:1], dtype="uint16", full_scale=4095)
+    torch.testing.assert_close(read_stack(tmp_path / "one.PNG"), frames[:1].float())
+
+
+@pytest.mark.parametrize("dtype", ["float16", "float32", "float64"])
+@pytest.mark.parametrize("ending", [".tif", ".npy", ".h5", ".zarr", ".raw"])
+def test_floats_keep_their_values_also_nan_and_infinity(tmp_path, dtype, ending):
+    frames = torch.tensor([[[0.5, -2.0], [1e4, 0.25]], [[np.nan, np.inf], [0.0, 1.0]]])
+    path = tmp_path / f"frames{ending}"
+    write_stack(path, frames, dtype=dtype)
+    assert read_stack_info(path) == StackInfo((2, 2, 2), dtype, None)
+    torch.testing.assert_close(read_stack(path, full_scale=4095), frames, equal_nan=True, rtol=0, atol=0)
+
+
+def test_values_are_rounded_and_clipped_to_full_scale(tmp_path):
+    frames = torch.tensor([[[-0.3, 1.7, 0.49 / 4095, 0.51 / 4095, 1.0]]])
+    write_stack(tmp_path / "frames.tif", frames, dtype="uint16", full_scale=4095)
+    assert tifffile.imread(tmp_path / "frames.tif").tolist() == [[[0, 4095, 0, 1, 4095]]]
+
+
+def test_full_scale_argument_has_priority(tmp_path):
+    write_stack(tmp_path / "frames.tif", torch.full((2, 4, 4), 0.5), dtype="uint16", full_scale=1000)
+    assert read_stack(tmp_path / "frames.tif").unique().tolist() == [0.5]
+    assert read_stack(tmp_path / "frames.tif", full_scale=2000).unique().tolist() == [0.25]
+
+
+def test_png_files_are_read_in_natural_order(tmp_path):
+    for index in (2, 10, 1, 9):
+        cv2.imwrite(str(tmp_path / f"shot{index}.png"), np.full((4, 5), index, np.uint8))
+    (tmp_path / "notes.txt").write_text("not a frame")
+    assert (read_stack(tmp_path)[:, 0, 0] * 255).round().tolist() == [1, 2, 9, 10]
 
 
 @pytest.mark.parametrize(("compression", "big"), [("zlib", True), ("lzma", False), ("lzw", False), ("zstd", True)])
@@ -103,8 +180,6 @@ def test_folder_of_float_frames_contains_tiff_files(tmp_path):
     write_stack(tmp_path / "frames", torch.from_numpy(COUNTS / 4095.0))
     assert sorted(file.name for file in (tmp_path / "frames").iterdir()) == [f"frame_000{i}.tif" for i in range(3)]
     np.testing.assert_allclose(read_stack(tmp_path / "frames").numpy(), COUNTS / 4095, rtol=1e-6)
-    cv2.imwrite(str(tmp_path / "frames" / "x.png"), COUNTS[0])
-    refuses(lambda: read_stack(tmp_path / "frames"), "contains both PNG and TIFF files")
 
 
 @pytest.mark.parametrize(("ending", "message"), [(".TOY", "endings must be like '.tif'"), (None, "has no file ending")])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import tifffile
 from refusals import refuses
-from small_stack import FRAMES, OPTIONS, STILL, TIMING, process_small
+from small_stack import FRAMES, OPTIONS, STILL, TIMING, process_small, stop_after
 from truth import decibel
 
 import rsvib_torch as rsv
@@ -34,12 +34,8 @@ def test_dask_workers_give_the_same_bytes(whole, tmp_path):
 
 
 def test_run_with_threads_is_resumed_with_dask(whole, tmp_path):
-    def stop(done, total):
-        if done > FRAMES // 2:
-            raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
-        process_small(whole / "frames.tif", tmp_path / "out.tif", progress=stop)
+        process_small(whole / "frames.tif", tmp_path / "out.tif", progress=stop_after(FRAMES // 2))
     with cluster_of(1) as cluster:
         options = {"scheduler": cluster.scheduler_address, "resume": True}
         report = process_small(whole / "frames.tif", tmp_path / "out.tif", **options)

@@ -11,20 +11,10 @@ import numpy as np
 import pytest
 import tifffile
 from attacks.small_runs import fork
-from small_stack import FRAMES, OPTIONS, WINDOWS, process_small
+from small_stack import FRAMES, OPTIONS, WINDOWS, process_small, stop_after
 
 from rsvib_torch.stacks import read_manifest
 from rsvib_torch.stacks.run_folder import work_folder
-
-
-def stop_after(frames):
-    """A function of the progress of a run that interrupts it."""
-
-    def stop(done, total):
-        if done > frames:
-            raise KeyboardInterrupt
-
-    return stop
 
 
 def process_with_limit(source, sink, limit, **options):
@@ -38,8 +28,10 @@ def interrupt_a_run(whole, tmp_path):
     """A folder with a run that was interrupted."""
     shutil.copy(whole / "frames.tif", tmp_path)
     with pytest.raises(KeyboardInterrupt):
-        process_small(tmp_path / "frames.tif", tmp_path / "out.tif", progress=stop_after(8))
+        process_small(tmp_path / "frames.tif", tmp_path / "out.tif", progress=stop_after(FRAMES // 2), workers=2)
+    assert not [thread.name for thread in threading.enumerate() if thread.name.startswith("rsvib")]
     assert work_folder(tmp_path / "out.tif").is_dir()
+    assert not (tmp_path / "out.tif").exists()
     return tmp_path
 
 
@@ -72,13 +64,17 @@ def test_an_edited_journal_is_refused(interrupted):
     assert journal.read_bytes() == edited
 
 
-@pytest.mark.parametrize("written", [slice(0, -9), slice(0, 0)])
-def test_the_window_of_an_incomplete_line_of_the_journal_is_computed_again(interrupted, whole, written):
+@pytest.mark.parametrize("written", [None, -9, 0])
+def test_all_windows_before_an_incomplete_line_of_the_journal_are_kept(interrupted, whole, written):
     journal = work_folder(interrupted / "out.tif") / "journal"
-    *lines, last = journal.read_bytes().splitlines(keepends=True)
-    journal.write_bytes(b"".join([*lines, last[written], bytes(100)]))
+    *lines, last = journal.read_bytes().splitlines(keepends=True)  # the first one is the header
+    complete = len(lines)
+    if written is not None:
+        journal.write_bytes(b"".join([*lines, last[:written], bytes(100)]))
+        complete -= 1
     report = process_small(interrupted / "frames.tif", interrupted / "out.tif", resume=True)
-    assert report.resumed == len(lines) - 1  # the first line is the header
+    assert 2 < report.resumed == complete < WINDOWS
+    assert {path.name for path in interrupted.iterdir()} == {"frames.tif", "out.tif", "out.tif.manifest.json"}
     for name in ("out.tif", "out.tif.manifest.json"):
         assert (interrupted / name).read_bytes() == (whole / name).read_bytes()
 
@@ -108,18 +104,6 @@ def test_disk_that_fills_up_keeps_complete_windows(whole, tmp_path):
     report = process_small(whole / "frames.tif", tmp_path / "out.npy", bad_frames="skip", resume=True)
     assert report.resumed == WINDOWS
     assert (tmp_path / "out.npy").read_bytes() == (whole / "out.npy").read_bytes()
-
-
-def test_keyboard_interrupt_keeps_complete_windows(whole, tmp_path):
-    with pytest.raises(KeyboardInterrupt):
-        process_small(whole / "frames.tif", tmp_path / "out.tif", progress=stop_after(FRAMES // 2), workers=2)
-    assert not [thread.name for thread in threading.enumerate() if thread.name.startswith("rsvib")]
-    assert not (tmp_path / "out.tif").exists()
-    report = process_small(whole / "frames.tif", tmp_path / "out.tif", resume=True)
-    assert 2 < report.resumed < WINDOWS
-    assert {path.name for path in tmp_path.iterdir()} == {"out.tif", "out.tif.manifest.json"}
-    for name in ("out.tif", "out.tif.manifest.json"):
-        assert (tmp_path / name).read_bytes() == (whole / name).read_bytes()
 
 
 def test_run_stops_if_the_input_is_removed_and_can_be_resumed(whole, tmp_path):

@@ -9,6 +9,7 @@ import pytest
 import torch
 from program import refused, rsvib
 from refusals import refuses
+from small_stack import stop_after
 from truth import Curve, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
@@ -70,6 +71,12 @@ def errors_of(found, start, first=0):
     return np.array(errors)
 
 
+def scores(found, name, expected):
+    """Errors over standard deviations of the tone of each axis in reliable frames; ``expected`` is (T, 2) or (2,)."""
+    values, stds = (getattr(part, name)[..., 0].numpy() for part in (found.vibration, found.std))
+    return ((values - expected) / stds)[found.reliable.numpy()]
+
+
 def test_each_frame_has_the_vibration_at_its_time(place):
     frames = np.load(place / "frames.npy")
     found = rsv.follow_vibration(frames, TIMING)
@@ -111,8 +118,7 @@ def test_the_frames_before_and_behind_a_change_of_frequency_are_followed():
     assert reliable.sum(0).tolist() == [19, 19]
     assert not reliable[10].any()
     speeds = np.where(np.arange(20)[:, None] < 10, FREQUENCY, FREQUENCY - [28.3, 9.0])
-    z = (found.vibration.frequency[..., 0].numpy() - speeds) / found.std.frequency[..., 0].numpy()
-    assert np.abs(z[reliable]).max() < 3
+    assert np.abs(scores(found, "frequency", speeds)).max() < 3
     amplitude = found.vibration.amplitude[..., 0].numpy()
     assert np.abs(amplitude - AMPLITUDE)[reliable].max() < 0.05
 
@@ -134,9 +140,7 @@ def test_a_large_vibration_that_decays_fast_is_followed():
     assert reliable.sum() > 20
     assert reliable[0].all()
     middles = np.arange(12)[:, None] * TIMING.frame_period + 64e-4 + 0.5 * TIMING.exposure_time
-    z = found.vibration.amplitude[..., 0].numpy() - 2.5 * AMPLITUDE * np.exp(-2.5 * middles)
-    z /= found.std.amplitude[..., 0].numpy()
-    assert np.abs(z[reliable]).max() < 4
+    assert np.abs(scores(found, "amplitude", 2.5 * AMPLITUDE * np.exp(-2.5 * middles))).max() < 4
 
 
 def test_frequencies_of_a_sweep_are_within_their_standard_deviations():
@@ -145,8 +149,7 @@ def test_frequencies_of_a_sweep_are_within_their_standard_deviations():
     turned = Curve(lambda t: AMPLITUDE * np.sin(2 * np.pi * (start + 0.5 * rate * t[..., None]) * t[..., None] + PHASE))
     found = rsv.follow_vibration(take_frames(SCENE, TIMING, turned, 30, noise=0.003), TIMING)
     frequency = start + rate * (np.arange(30)[:, None] * TIMING.frame_period + 64e-4)
-    z = (found.vibration.frequency[..., 0].numpy() - frequency) / found.std.frequency[..., 0].numpy()
-    z = z[found.reliable.numpy()]
+    z = scores(found, "frequency", frequency)
     assert len(z) > 40
     assert np.abs(z).max() < 3
     assert 0.2 < np.sqrt(np.square(z).mean()) < 1.2
@@ -194,12 +197,8 @@ def test_windows_state_the_vibration_of_their_frames(place, tmp_path):
 
 
 def test_result_does_not_depend_on_interruptions_windows_at_once_or_workers(place, tmp_path):
-    def stop(done, total):
-        if done > 12:
-            raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
-        follow(place, tmp_path / "out.npy", progress=stop)
+        follow(place, tmp_path / "out.npy", progress=stop_after(12))
     with pytest.raises(ValueError, match=r'cannot resume: settings\.follow was true, now it is "auto"'):
         rsv.process_stack(place / "frames.npy", tmp_path / "out.npy", TIMING, resume=True)
     report = follow(place, tmp_path / "out.npy", resume=True, workers=3)
