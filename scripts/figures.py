@@ -13,7 +13,7 @@ import torch
 from benchmarks import live, mosaic
 from benchmarks.finer import EXPOSURE_ROWS, FADE, ROW_TIME, SHAKE, decibel, interpolated
 from benchmarks.finer import MARGIN as FINER_MARGIN
-from benchmarks.independent_camera import ALIASING, POINTS_PER_PX, Array, after_optics, closed, still_image, take_frames
+from benchmarks.independent_camera import POINTS_PER_PX, Array, after_optics, closed, still_image, take_frames
 from benchmarks.pipeline import camera
 from kornia.augmentation import AugmentationSequential
 from matplotlib.figure import Figure
@@ -131,7 +131,7 @@ def finer_grid() -> Figure:
     side, noise, count = 160, 0.002, 8
     scene, size = after_optics(wedge_scene(side), 0.3), (side, side)
     timing = rsv.SensorTiming(ROW_TIME, EXPOSURE_ROWS, 2 * side + 59)
-    clean = take_frames(scene, SHAKE, timing, count, size, **ALIASING)
+    clean = take_frames(scene, SHAKE, timing, count, size, points=POINTS_PER_PX)
     generator = np.random.default_rng(1)
     frames = torch.from_numpy(clean + noise * generator.standard_normal(clean.shape)).float()
     still = still_image(scene, size) + noise * generator.standard_normal(clean.shape)
@@ -192,7 +192,7 @@ def tracking() -> Figure:
     for place, (quantity, limit) in enumerate((("frequency (Hz)", 0.25), ("amplitude (px)", 0.12))):
         panel = panels[place]
         for axis, (name, colour) in enumerate(zip("xy", COLOURS, strict=True)):
-            error = np.array(values)[:, place, axis] - truth[place][axis]
+            error = np.array(values)[:, place, axis] - truth[place][:, axis]
             deviation = 2 * np.array(stds)[:, place, axis]
             panel.plot(when, error, color=colour, label=name)
             panel.fill_between(when, -deviation, deviation, color=colour, alpha=0.15, linewidth=0)

@@ -8,8 +8,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
+from benchmarks.independent_camera import POINTS_PER_PX as FINER
 from benchmarks.independent_camera import (
-    ALIASING,
     Array,
     Shake,
     after_optics,
@@ -18,7 +18,6 @@ from benchmarks.independent_camera import (
     still_image,
     take_frames,
 )
-from benchmarks.independent_camera import POINTS_PER_PX as FINER
 from torch import Tensor
 
 import rsvib_torch as rsv
@@ -45,7 +44,7 @@ TIMING = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=571)
 
 def taken(scene: Array, count: int, size: int, shake: Shake = SHAKE) -> Array:
     """Noise-free frames (T, size, size) of a scene on the grid of the camera."""
-    return take_frames(scene, shake, TIMING, count, (size, size), **ALIASING)
+    return take_frames(scene, shake, TIMING, count, (size, size), points=FINER)
 
 
 def noisy(clean: Array, noise: float, seed: int = 1) -> Tensor:

@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from benchmarks import honesty_camera
 from benchmarks.independent_camera import (
-    ALIASING,
     POINTS_PER_PX,
     Array,
     Shake,
@@ -101,7 +100,7 @@ def record(
     scene, shape = after_optics(closed(fine, FADE), sigma), (size, size)
     timing = rsv.SensorTiming(ROW_TIME, exposure, max(2 * size + 59, exposure + 59))
     shake = replace(SHAKE, image_motion=np.array([image_motion, 0.0]))
-    frames = take_frames(scene, shake, timing, max(FRAMES), shape, **ALIASING)
+    frames = take_frames(scene, shake, timing, max(FRAMES), shape, points=POINTS_PER_PX)
     vibration = rsv.Vibration(
         *(torch.from_numpy(v) for v in (SHAKE.amplitude, SHAKE.frequency, SHAKE.phase)), shake.image_motion
     )

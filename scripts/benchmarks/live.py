@@ -44,25 +44,20 @@ class Changing:
     doublings: float = 0.0
 
     def amplitude(self, times: NDArray[Any]) -> NDArray[Any]:
-        """(2, ...) px."""
+        """(..., 2) px."""
         later = np.maximum(times - BEFORE, 0.0)
-        return np.stack([AMPLITUDE[0] * 2.0 ** (self.doublings * later), AMPLITUDE[1] + 0 * times])
+        return np.stack([AMPLITUDE[0] * 2.0 ** (self.doublings * later), AMPLITUDE[1] + 0 * times], -1)
 
     def frequency(self, times: NDArray[Any]) -> NDArray[Any]:
-        """(2, ...) Hz."""
+        """(..., 2) Hz."""
         later = np.maximum(times - BEFORE, 0.0)
-        return np.stack([FREQUENCY[0] + self.sweep * later, FREQUENCY[1] + 0 * times])
+        return np.stack([FREQUENCY[0] + self.sweep * later, FREQUENCY[1] + 0 * times], -1)
 
     def displacement(self, times: NDArray[Any]) -> NDArray[Any]:
-        """(2, ...) px."""
+        """(..., 2) px."""
         later = np.maximum(times - BEFORE, 0.0)
-        cycles = np.stack([FREQUENCY[0] * times + 0.5 * self.sweep * later**2, FREQUENCY[1] * times])
-        phase = PHASE.reshape(2, *(1,) * times.ndim)
-        return np.asarray(self.amplitude(times) * np.sin(2 * np.pi * cycles + phase))
-
-    def longest_path(self, duration: float) -> float:
-        """Upper bound of the path in px within a duration."""
-        return float(4 * np.pi * (AMPLITUDE * FREQUENCY).max() * duration)
+        cycles = np.stack([FREQUENCY[0] * times + 0.5 * self.sweep * later**2, FREQUENCY[1] * times], -1)
+        return np.asarray(self.amplitude(times) * np.sin(2 * np.pi * cycles + PHASE))
 
 
 def timing_of(size: int, exposure_rows: int = EXPOSURE_ROWS) -> rsv.SensorTiming:
@@ -74,7 +69,7 @@ def timing_of(size: int, exposure_rows: int = EXPOSURE_ROWS) -> rsv.SensorTiming
 def frames_of(size: int, motion: Changing, count: int) -> NDArray[np.uint8]:
     """Frames (T, size, size) with noise."""
     scene = closed(city_and_fields(size + 2 * MARGIN, size + 2 * MARGIN, seed=SEED).double().numpy(), MARGIN // 2)
-    taken = take_frames(scene, motion, timing_of(size), count, (size, size), between=4)  # type: ignore[arg-type]
+    taken = take_frames(scene, motion, timing_of(size), count, (size, size))
     noisy = taken + NOISE * np.random.default_rng(SEED).standard_normal(taken.shape)
     return np.clip(np.round(255 * noisy), 0, 255).astype(np.uint8)
 

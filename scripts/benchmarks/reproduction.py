@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from benchmarks import independent_camera
-from benchmarks.independent_camera import Array, Shake, closed, fine_rows
+from benchmarks.independent_camera import Array, Shake, closed
 from benchmarks.pipeline import camera
 from harness import Rows, one_thread, table
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
@@ -100,20 +100,14 @@ BORDER = 32  # px of scene beyond the largest displacement, over which it fades 
 OPTICS = 0.5  # px; sigma of the Gaussian optics, in addition to square pixels
 SEED, BITS = 2023, 12
 RIM, EDGE_RIM = 32, 40  # px at the border that are not evaluated, because they are partly outside the frame
-CAMERA = {  # 5 nodes of an exposure: exact to 1e-6 for half a pixel of motion blur, to 1e-4 for 3 px
-    "points": PITCH,
-    "between": 4,
-    "nodes": 5,
-}
 MTF_FREQUENCY = np.linspace(0.0, 0.5, 51)  # cycles/px; every fifth value is stored
 SHOWN = {"at 0.25 cycles/px": 5, "at 0.4": 8, "at Nyquist": 10}  # places of stored values
 
 
 class Scene(NamedTuple):
-    """A periodic scene (``PITCH`` samples per px), its interpolated spectra, and the frame of a camera at rest."""
+    """A scene (``PITCH`` samples per px), and the frame of a camera at rest."""
 
     samples: Array
-    spectra: Any
     still: Array
 
 
@@ -137,13 +131,12 @@ def draw(target: str, size: Sequence[int], image_motion: float = 0.0) -> Scene:
         drawn = city_and_fields(height, width, SEED, sigma=sigma)
     samples = closed(drawn.double().numpy(), (BORDER - 8) * PITCH)
     still = samples[down : height - down : PITCH, across : width - across : PITCH]
-    return Scene(samples, fine_rows(samples, CAMERA["between"]), still)
+    return Scene(samples, still)
 
 
 def taken(scene: Scene, shake: Shake, timing: Any, count: int = 2) -> Array:
     """Frames without noise."""
-    size = scene.still.shape
-    return independent_camera.take_frames(scene.samples, shake, timing, count, size, rows=scene.spectra, **CAMERA)
+    return independent_camera.take_frames(scene.samples, shake, timing, count, scene.still.shape, points=PITCH)
 
 
 def counts_of(frames: Array, noise: float, seed: int) -> Array:

@@ -40,7 +40,7 @@ def planes_of(rows: int, count: int) -> tuple[list[NDArray[np.uint8]], list[Arra
         later = 2 * np.pi * FREQUENCY * 0.5 * (step - 1) * timing.row_time
         shake = Shake(AMPLITUDE[:, None] / step, FREQUENCY[:, None], (PHASE + later)[:, None], np.zeros(2))
         chroma = rsv.SensorTiming(step * timing.row_time, EXPOSURE_ROWS / step, timing.frame_rows / step)
-        taken = take_frames(closed(scene, MARGIN // 2), shake, chroma, min(count, RATE), size, between=4)
+        taken = take_frames(closed(scene, MARGIN // 2), shake, chroma, min(count, RATE), size)
         noisy = taken + NOISE / step * np.random.default_rng(SEED + number).standard_normal(taken.shape)
         low, high = (16, 235) if step == 1 else (16, 240)
         counts.append(np.clip(np.round(low + (high - low) * noisy), 0, 255).astype(np.uint8))
