@@ -2,8 +2,8 @@
 
 A section is a module with
 
-* ``OPTIONS``: its options, by name: the default, the help text, and for values that do not follow from the default
-  their type or their choices. ``QUICK``: values of options that ``--quick`` sets, for a run of seconds;
+* ``OPTIONS``: its options, by name: the default, the help text, and for some the choices. ``QUICK``: values of options
+  that ``--quick`` sets, for a run of seconds;
 * ``rows(options)``: the figures, one dictionary per case, of numbers, texts, lists and dictionaries;
 * ``lines(rows, options)``: the tables in Markdown, without further measurement.
 
@@ -32,7 +32,7 @@ import torch
 import rsvib_torch as rsv
 
 Rows = list[dict[str, Any]]
-OptionTable = Mapping[str, tuple[Any, ...]]  # default, help text, and for some the type or the choices
+OptionTable = Mapping[str, tuple[Any, ...]]  # default, help text, and for some the choices
 
 RESULTS = Path(__file__).parent / "benchmarks" / "results"
 # Environment variables that must be set before a process starts. PyTorch uses huge pages, as NumPy does by default.
@@ -57,18 +57,16 @@ def with_generated_part(page: str, lines: Iterable[str]) -> str:
 
 def add_options(parser: argparse.ArgumentParser, options: OptionTable) -> None:
     """Add the options of a section; sections that share an option have it from the same table."""
-    for name, (default, text, *kind) in options.items():
-        flag = "--" + name.replace("_", "-")
-        if isinstance(default, bool):
-            parser.add_argument(flag, action="store_true", help=text)
-            continue
-        several = isinstance(default, tuple | list)
-        more: dict[str, Any] = {"nargs": "*"} if several else {}
-        if kind and not isinstance(kind[0], type):
-            more["choices"] = kind[0]
-        else:
-            more["type"] = kind[0] if kind else type(default[0] if several else default)
-        parser.add_argument(flag, default=default, help=f"{text} (default: {default})", **more)
+    for name, (default, text, *choices) in options.items():
+        several = isinstance(default, tuple)
+        parser.add_argument(
+            "--" + name.replace("_", "-"),
+            default=default,
+            help=f"{text} (default: {default})",
+            type=type(default[0] if several else default),
+            choices=choices[0] if choices else None,
+            nargs="*" if several else None,
+        )
 
 
 def devices() -> list[str]:
@@ -102,11 +100,6 @@ class Timed:
     def figures(self) -> dict[str, float]:
         """Median, shortest and longest time."""
         return {"seconds": self.seconds, "seconds_least": min(self.runs), "seconds_most": max(self.runs)}
-
-
-def shown_seconds(row: dict[str, Any]) -> str:
-    """Median and range of ``Timed.figures`` as a cell of a table."""
-    return f"{row['seconds']:.3f} ({row['seconds_least']:.3f} to {row['seconds_most']:.3f})"
 
 
 def finish() -> None:
@@ -143,11 +136,6 @@ def in_turns(works: dict[str, Callable[[], Any]], runs: int) -> dict[str, Timed]
         for name, work in works.items():
             seconds[name].append(seconds_of(work))
     return {name: Timed(results[name], tuple(seconds[name])) for name in works}
-
-
-def named(name: str, device: str) -> str:
-    """Name of a task on a device."""
-    return name if device == "cpu" else f"{name} on {device}"
 
 
 def plain_environment() -> dict[str, str]:

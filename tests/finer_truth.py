@@ -9,33 +9,10 @@ import numpy as np
 import pytest
 import torch
 from benchmarks.independent_camera import POINTS_PER_PX as FINER
-from benchmarks.independent_camera import (
-    Array,
-    Shake,
-    after_optics,
-    closed,
-    mosaic_of,
-    still_image,
-    take_frames,
-)
+from benchmarks.independent_camera import Array, Shake, take_frames
 from torch import Tensor
 
 import rsvib_torch as rsv
-
-__all__ = [
-    "FINER",
-    "SHAKE",
-    "TIMING",
-    "VIBRATION",
-    "Shake",
-    "after_optics",
-    "check_gradient",
-    "closed",
-    "mosaic_of",
-    "noisy",
-    "still_image",
-    "taken",
-]
 
 SHAKE = Shake(np.array([[3.1], [5.2]]), np.array([[90.0], [61.0]]), np.array([[0.4], [1.3]]), np.zeros(2))
 VIBRATION = rsv.Vibration([3.1, 5.2], [90.0, 61.0], [0.4, 1.3])

@@ -78,7 +78,6 @@ def measure(difficult: Recorded, simple: Recorded, runs: int) -> dict[str, Any]:
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    """Times of all difficult inputs."""
     size, results = options.cost_size, []
     inputs = [(kind, name, number) for kind, classes in OF_CLASSES.items() for name, number in classes]
     for kind, name, number in inputs[: options.cost_inputs]:

@@ -333,7 +333,6 @@ def errors_of(kind: str, number: int, size: int) -> list[Error]:
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    """The figures of each quantity of each kind."""
     figures: Rows = []
     with one_thread():
         for kind in options.bar_kinds:
@@ -357,7 +356,6 @@ WITHIN = {"68": 1.0, "95": 1.96, "99.7": 3.0}
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:
-    """The figures as a Markdown table."""
     heads = ("recordings", "quantity", "values", "rms of z", *(f"{share} %" for share in WITHIN), "largest z")
     ratios = {"median of std / bound": "std_over_bound", "rms of error / bound": "error_over_bound"}
     cells = []

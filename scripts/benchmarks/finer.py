@@ -268,7 +268,6 @@ def rows(options: argparse.Namespace) -> Rows:
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:
-    """Tables of the scenes and of the conditions."""
     return [
         f"PSNR in dB against the noise-free scene after optics and pixel, without a border of {RIM} points; frames of "
         f"{options.finer_size} x {options.finer_size} px, exposure of {EXPOSURE_ROWS} rows, vibration detected in all "

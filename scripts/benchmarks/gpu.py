@@ -185,7 +185,6 @@ def rows(options: argparse.Namespace) -> Rows:
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:
-    """The cases of all devices as a Markdown table."""
     rates = {row["device"]: row["bytes_a_second"] for row in results if row["part"] == "device"}
     text = [
         f"Pairs of frames in batches of stacks, exposure of {EXPOSURE_ROWS} rows; the tracker takes one frame. "

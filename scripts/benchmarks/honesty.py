@@ -271,7 +271,6 @@ def judge_case(name: str, number: int, size: int) -> dict[str, Any]:
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    """All cases of the classes."""
     with one_thread():
         return [
             judge_case(name, number, options.honesty_size)

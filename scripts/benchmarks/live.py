@@ -217,7 +217,6 @@ def tracked_frames(pixels: NDArray[np.uint8], size: int, method: str) -> Callabl
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    """Session, changes, and speed next to peers."""
     size = options.live_size
     pixels = frames_of(size, Changing(), RATE)
     results = [session(pixels, size, options.minutes), accuracy(pixels, size, options.live_periods)]
@@ -253,7 +252,6 @@ QUANTITIES = {  # of the session
 
 
 def lines(rows: Rows, options: argparse.Namespace) -> list[str]:
-    """The tables in Markdown."""
     one, errors_of, *others = rows
     cells = [(name, text.format(**one)) for name, text in QUANTITIES.items()]
     for place, (quantity, unit) in enumerate((("amplitude", "px"), ("frequency", "Hz"))):

@@ -130,13 +130,11 @@ def cases(name: str, side: int) -> Rows:
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    """PSNR on pixels and on half pixels for all scenes, noise levels and numbers of frames."""
     with one_thread():
         return [row for name in options.mosaic_scenes for row in cases(name, options.mosaic_size)]
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:
-    """A table of the figures."""
     names = list(results[0]["peers"])
     text = [
         f"PSNR in dB of all three colours against the noise-free scene after optics and pixel, without a border of "

@@ -66,13 +66,11 @@ def case(name: str, size: tuple[int, int]) -> dict[str, Any]:
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    """The detections of all cases."""
     with one_thread():
         return [case(name, tuple(options.orbit_size)) for name in CASES]
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:
-    """A table of true and found tones."""
     height, width = options.orbit_size
     text = [
         f"Tones along x and y in frames of {height} x {width} px of an independent camera ({1 / FRAME_PERIOD:.1f} "

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from benchmarks import library_chain as libraries
 from benchmarks.independent_camera import Shake, closed, take_frames
-from harness import Rows, Timed, in_turns, named, shown_seconds, table, table_of
+from harness import Rows, Timed, in_turns, table, table_of
 from torch import Tensor
 
 import rsvib_torch as rsv
@@ -199,7 +199,10 @@ def speed(options: argparse.Namespace) -> Rows:
         if "wiener" in done:
             done["wiener"] = done["wiener"].scaled(size / len(rows_))
         results += [
-            {"chain": named(name, device), **_figures(done[first], done[second], done["round trip"])}
+            {
+                "chain": name if device == "cpu" else f"{name} on {device}",
+                **_figures(done[first], done[second], done["round trip"]),
+            }
             for name, (first, second) in chains.items()
         ]
     return results
@@ -231,7 +234,6 @@ def rows(options: argparse.Namespace) -> Rows:
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:
-    """The figures as Markdown tables."""
     compared, timed = ([row for row in results if row["part"] == part] for part in ("accuracy", "speed"))
     text = [
         f"Detection and restoration of a pair of frames, {options.pipeline_rows} x {options.grid_size} px. Errors of "
@@ -250,7 +252,7 @@ def lines(results: Rows, options: argparse.Namespace) -> list[str]:
     text += table_of(
         timed,
         (f"a pair of {options.size} x {options.size} px", "{chain}"),
-        ("seconds", shown_seconds),
+        ("seconds", "{seconds:.3f} ({seconds_least:.3f} to {seconds_most:.3f})"),
         ("detection", "{detection_seconds:.3f}"),
         ("restoration", "{restoration_seconds:.3f}"),
         ("FFT round trips: detection", "{detection_round_trips:.1f}"),

@@ -331,7 +331,6 @@ def global_shutter(frames: int = 24, candidates: int = 4000) -> Rows:
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    """All trials, and the camera at rest."""
     results: Rows = []
     with one_thread():
         for target in TARGETS:
@@ -455,7 +454,6 @@ def condition_cells(results: Rows) -> list[list[str]]:
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:
-    """The comparison with the paper."""
     noise, (height, width) = options.trial_noises[0], options.trial_size
     usual = chosen(results, noise=noise, speed=0.0)
     detection, restoration = (chosen(usual, part=part) for part in ("detection", "restoration"))

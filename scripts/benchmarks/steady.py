@@ -182,7 +182,6 @@ def with_vidstab(source: Path, target: Path) -> dict[str, Any] | None:
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    """The figures of each clip: as taken, by vidstab and by the package."""
     scene, hand = scene_of(options.steady_photo), angles_of(options.steady_rates, options.steady_frames)
     timing = rsv.SensorTiming(ROW_TIME, EXPOSURE / ROW_TIME, 1 / RATE / ROW_TIME)
     results = []
@@ -201,7 +200,6 @@ def rows(options: argparse.Namespace) -> Rows:
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:
-    """The table in Markdown."""
     scene = "a photograph" if options.steady_photo else "a drawn scene"
     hand = "the rates of a gyroscope in a hand" if options.steady_rates else "a drawn path of a hand"
     text = (

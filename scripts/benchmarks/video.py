@@ -62,7 +62,6 @@ def psnr_of(path: Path, still: list[Array], rim: int = 24) -> list[float]:
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    """Figures of each method, and of the video as taken."""
     count = options.video_frames
     planes, still = planes_of(options.video_rows, count)
     with tempfile.TemporaryDirectory() as folder:
@@ -86,7 +85,6 @@ def rows(options: argparse.Namespace) -> Rows:
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:
-    """The table in Markdown."""
     height, count = options.video_rows, options.video_frames
     text = [
         f"{count} frames of {16 * height // 9} x {height} px in colour, H.264 (crf {CRF}), by `process_video` (`rsvib "
