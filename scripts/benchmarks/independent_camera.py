@@ -11,7 +11,7 @@ spectrum, and the frames sample the result at the pixels.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,25 +21,6 @@ from scipy.interpolate import BSpline
 Array = NDArray[np.float64]
 
 POINTS_PER_PX = 4  # of the scenes of cameras that alias
-
-
-class Timing(Protocol):
-    """Times of a camera in s: of a row, 0 for a global shutter; of an exposure; from frame to frame."""
-
-    @property
-    def row_time(self) -> float: ...  # noqa: D102
-    @property
-    def exposure_time(self) -> float: ...  # noqa: D102
-    @property
-    def frame_period(self) -> float: ...  # noqa: D102
-
-
-class Moving(Protocol):
-    """A motion of the image."""
-
-    def displacement(self, times: Array) -> Array:
-        """Displacement (..., 2) in px at times (...) in s, axes (x, y)."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -87,8 +68,8 @@ def exposed(seen_at: Callable[[Array], Array], starts: Array, exposure: float, n
 
 def take_frames(
     scene: Array,
-    motion: Moving,
-    timing: Timing,
+    motion: Any,
+    timing: Any,
     num_frames: int,
     size: tuple[int, int],
     *,
@@ -97,6 +78,8 @@ def take_frames(
 ) -> Array:
     """Frames (T, H, W) without noise, centred on a scene of ``points`` per px along both axes.
 
+    ``motion.displacement(times)`` is (N, 2) in px, axes (x, y), at times (N,) in s. ``timing`` has ``row_time`` (0 for
+    a global shutter), ``exposure_time`` and ``frame_period`` in s.
     The spline has ``between`` rows per row of the scene; 1 suffices for scenes that are blurred by 0.8 px or more.
     """
     top, left = ((whole - points * part) // 2 for whole, part in zip(scene.shape, size, strict=True))

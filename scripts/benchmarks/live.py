@@ -204,16 +204,11 @@ def phase_correlated(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.stack(results)
 
 
-def tracked_frames(pixels: NDArray[np.uint8], size: int, method: str) -> Callable[[], NDArray[np.uint8]]:
-    """Function that tracks and restores the frames as fast as possible."""
-
-    def run() -> NDArray[np.uint8]:
-        output = Output(keeps=True)
-        tracker = rsv.VibrationTracker(timing_of(size), method=method)
-        run_live(Repeated(pixels, len(pixels), paced=False), tracker, [output], drops=False)
-        return np.stack(output.frames)
-
-    return run
+def tracked_frames(pixels: NDArray[np.uint8], size: int, method: str) -> NDArray[np.uint8]:
+    """Frames that are tracked and restored as fast as possible."""
+    output, tracker = Output(keeps=True), rsv.VibrationTracker(timing_of(size), method=method)
+    run_live(Repeated(pixels, len(pixels), paced=False), tracker, [output], drops=False)
+    return np.stack(output.frames)
 
 
 def rows(options: argparse.Namespace) -> Rows:
@@ -226,8 +221,8 @@ def rows(options: argparse.Namespace) -> Rows:
     clip = np.concatenate([pixels, pixels])
     tasks: dict[str, Callable[[], NDArray[np.uint8]]] = {
         "as taken": lambda: clip,
-        "`VibrationTracker`, dewarp": tracked_frames(clip, size, "dewarp"),
-        "`VibrationTracker`, exact": tracked_frames(clip, size, "exact"),
+        "`VibrationTracker`, dewarp": lambda: tracked_frames(clip, size, "dewarp"),
+        "`VibrationTracker`, exact": lambda: tracked_frames(clip, size, "exact"),
         "`cv2.phaseCorrelate`, `cv2.warpAffine`": lambda: phase_correlated(clip),
     }
     for name, work in tasks.items():

@@ -11,6 +11,7 @@ import argparse
 import math
 import warnings
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import torch
@@ -179,16 +180,13 @@ def speed(options: argparse.Namespace) -> Rows:
         found = detect(taken, timing, "direct").vibration
         works: dict[str, Callable[[], Any]] = {
             "round trip": lambda f=taken: torch.fft.irfft2(torch.fft.rfft2(f[0]), s=f.shape[1:]),
-            **{name: lambda n=name, f=taken: detect(f, timing, n) for name in DETECTIONS},
-            **{
-                method: lambda m=method, f=taken, v=found: restored_by(f, timing, v, m)
-                for method in ("exact", "dewarp")
-            },
+            **{name: partial(detect, taken, timing, name) for name in DETECTIONS},
+            **{method: partial(restored_by, taken, timing, found, method) for method in ("exact", "dewarp")},
         }
         if device == "cpu":
             array, rows_ = frames.numpy(), libraries.sampled_rows(size, RIM)
             lib = libraries.detect_by_libraries(array, timing)
-            works["libraries"] = lambda a=array: libraries.detect_by_libraries(a, timing)
+            works["libraries"] = partial(libraries.detect_by_libraries, array, timing)
             works["wiener"] = lambda a=array, r=rows_, v=lib: [
                 libraries.wiener_loop(libraries.slabs_and_kernels(a[i], r, timing, v, i), TIMED_BALANCE)
                 for i in range(2)

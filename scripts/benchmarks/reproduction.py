@@ -270,33 +270,29 @@ def trials(
 ) -> Rows:
     """Detection and restoration of two frames by all methods for all noises; without edges (None) detection only."""
     shake = shake_of(case["seed"], case["speed"] * (-1) ** case["seed"])
-    clean = taken(scene, shake, camera(EXPOSURE_ROWS, len(scene.still)))
-    return [row for noise in noises for row in trial(scene, shake, clean, case | {"noise": noise}, edges)]
-
-
-def trial(
-    scene: Scene, shake: Shake, clean: Array, case: dict[str, Any], edges: Sequence[tuple[str, rsv.SlantedEdge]] | None
-) -> Rows:
-    """Detection and restoration of two frames with one noise."""
-    array = counts_of(clean, case["noise"], case["seed"])
-    frames, timing = torch.from_numpy(array).float(), camera(EXPOSURE_ROWS, len(scene.still))
-    found = {name: rsv.detect_vibration(frames, timing, **options) for name, (options, _) in METHODS.items()}
-    results = [
-        {"part": "detection", **case, "method": name, "axis": axis, **values}
-        for name, result in found.items()
-        for axis, values in detection_values(result, shake).items()
-    ]
-    if edges is None:
-        return results
-    images = {DEGRADED: array}
-    restoring = {name: (found[name].vibration, options) for name, (_, options) in METHODS.items()}
-    for name, (motion, options) in {**restoring, JOINT: (found[DEFAULT].vibration, {"joint": 2})}.items():
-        images[name] = rsv.restore(frames, timing, motion, check=False, **options).double().numpy()
-    return results + [
-        {"part": "restoration", **case, "method": name, **row}
-        for name, restored in images.items()
-        for row in quality(restored, scene.still, edges)
-    ]
+    timing, results = camera(EXPOSURE_ROWS, len(scene.still)), []
+    clean = taken(scene, shake, timing)
+    for noise in noises:
+        array, of_noise = counts_of(clean, noise, case["seed"]), case | {"noise": noise}
+        frames = torch.from_numpy(array).float()
+        found = {name: rsv.detect_vibration(frames, timing, **options) for name, (options, _) in METHODS.items()}
+        results += [
+            {"part": "detection", **of_noise, "method": name, "axis": axis, **values}
+            for name, result in found.items()
+            for axis, values in detection_values(result, shake).items()
+        ]
+        if edges is None:
+            continue
+        images = {DEGRADED: array}
+        restoring = {name: (found[name].vibration, options) for name, (_, options) in METHODS.items()}
+        for name, (motion, options) in {**restoring, JOINT: (found[DEFAULT].vibration, {"joint": 2})}.items():
+            images[name] = rsv.restore(frames, timing, motion, check=False, **options).double().numpy()
+        results += [
+            {"part": "restoration", **of_noise, "method": name, **row}
+            for name, restored in images.items()
+            for row in quality(restored, scene.still, edges)
+        ]
+    return results
 
 
 class GlobalShutter(NamedTuple):
