@@ -16,18 +16,18 @@ import json
 import math
 import os
 import platform
-import statistics
 import subprocess
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from fractions import Fraction
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 import rsvib_torch as rsv
 
@@ -77,31 +77,6 @@ def devices() -> list[str]:
 # Timed runs
 
 
-@dataclass(frozen=True, eq=False)
-class Timed:
-    """Timed runs of a task."""
-
-    result: Any  # return value of the task
-    runs: tuple[float, ...]  # seconds of each run
-
-    @property
-    def seconds(self) -> float:
-        """The median."""
-        return statistics.median(self.runs)
-
-    def __add__(self, other: "Timed") -> "Timed":
-        """Sum of the times of two tasks, run by run; the result is that of the second."""
-        return Timed(other.result, tuple(a + b for a, b in zip(self.runs, other.runs, strict=True)))
-
-    def scaled(self, factor: float) -> "Timed":
-        """Times multiplied by a factor."""
-        return Timed(self.result, tuple(factor * seconds for seconds in self.runs))
-
-    def figures(self) -> dict[str, float]:
-        """Median, shortest and longest time."""
-        return {"seconds": self.seconds, "seconds_least": min(self.runs), "seconds_most": max(self.runs)}
-
-
 def finish() -> None:
     """Wait for a GPU, if it is used."""
     if torch.cuda.is_initialized():
@@ -128,14 +103,12 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def in_turns(works: dict[str, Callable[[], Any]], runs: int) -> dict[str, Timed]:
-    """Timed runs of each task; the tasks alternate, so that other load on the machine affects all of them equally."""
-    results = {name: work() for name, work in works.items()}  # warm-up
-    seconds: dict[str, list[float]] = {name: [] for name in works}
-    for _ in range(max(1, runs)):
-        for name, work in works.items():
-            seconds[name].append(seconds_of(work))
-    return {name: Timed(results[name], tuple(seconds[name])) for name in works}
+def in_turns(works: dict[str, Callable[[], Any]], runs: int) -> dict[str, NDArray[np.float64]]:
+    """Seconds of the runs of each task; they alternate, so that other load on the machine affects all tasks equally."""
+    for work in works.values():  # warm-up
+        work()
+    rounds = [[seconds_of(work) for work in works.values()] for _ in range(max(1, runs))]
+    return dict(zip(works, np.transpose(rounds), strict=True))
 
 
 def plain_environment() -> dict[str, str]:

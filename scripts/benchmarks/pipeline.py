@@ -14,10 +14,12 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
 from benchmarks import library_chain as libraries
 from benchmarks.independent_camera import Shake, closed, take_frames
-from harness import Rows, Timed, in_turns, table, table_of
+from harness import Rows, in_turns, table, table_of
+from numpy.typing import NDArray
 from torch import Tensor
 
 import rsvib_torch as rsv
@@ -195,7 +197,7 @@ def speed(options: argparse.Namespace) -> Rows:
             chains = {PAPER: ("libraries", "wiener"), FASTEST: ("libraries", "remap"), **chains}
         done = in_turns(works, options.runs)
         if "wiener" in done:
-            done["wiener"] = done["wiener"].scaled(size / len(rows_))
+            done["wiener"] *= size / len(rows_)
         results += [
             {
                 "chain": name if device == "cpu" else f"{name} on {device}",
@@ -206,15 +208,19 @@ def speed(options: argparse.Namespace) -> Rows:
     return results
 
 
-def _figures(detection: Timed, restoration: Timed, round_trip: Timed) -> dict[str, float]:
-    whole = detection + restoration
+def _figures(detection: NDArray[Any], restoration: NDArray[Any], round_trip: NDArray[Any]) -> dict[str, float]:
+    """Median, shortest and longest time of both steps, and the medians of each."""
+    whole, medians = detection + restoration, [float(np.median(one)) for one in (detection, restoration, round_trip)]
+    seconds = float(np.median(whole))
     return {
-        **whole.figures(),
-        "detection_seconds": detection.seconds,
-        "restoration_seconds": restoration.seconds,
-        "detection_round_trips": detection.seconds / round_trip.seconds,
-        "restoration_round_trips": restoration.seconds / 2 / round_trip.seconds,
-        "frames_a_second": 2 / whole.seconds,
+        "seconds": seconds,
+        "seconds_least": float(whole.min()),
+        "seconds_most": float(whole.max()),
+        "detection_seconds": medians[0],
+        "restoration_seconds": medians[1],
+        "detection_round_trips": medians[0] / medians[2],
+        "restoration_round_trips": medians[1] / 2 / medians[2],
+        "frames_a_second": 2 / seconds,
     }
 
 
