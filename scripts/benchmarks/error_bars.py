@@ -64,8 +64,7 @@ FIXED = {  # amplitudes (px, px, rad, 1) and frequencies of the axes
     "roll with the frequency of x": ((3.0, 5.0, 1e-3), (70.0, 61.0, 70.0)),
     "roll 1 mrad, zoom 5e-4": ((3.0, 5.0, 1e-3, 5e-4), (90.0, 61.0, 70.0, 53.0)),
 }
-FREE = {"free motion: walk": "walk", "free motion: smooth": "smooth", "free motion: tones": "tones"}
-FREE |= {"free motion: nearly blind": "blind"}
+FREE = tuple(f"free motion: {kind}" for kind in ("walk", "smooth", "tones", "nearly blind"))
 CALIBRATIONS = ("wall", "noisy wall", "textured", "weakly textured", "textured, four frames")
 BY_MOTION: dict[str, tuple[Any, Any, Any, Any]] = {  # amplitudes, frequencies, limits of the row time, and direction
     "row time by motion: 83 Hz along x, known to 12 %": (((3.0,), (0.0,)), ((83.0,), (1.0,)), (0.88, 1.12), "forward"),
@@ -231,7 +230,7 @@ def drawn(kind: str, draw: Generator) -> Curve:
 def free_motion(kind: str, number: int) -> Iterator[Error]:
     """Errors of the displacement of the rows of each axis, rms over the rows, and of what differs between frames."""
     draw = generator_of(kind, number)
-    motion = drawn(FREE[kind], draw)
+    motion = drawn(kind.removeprefix("free motion: "), draw)
     found = rsv.detect_motion(recorded(motion, FRAMES, draw), TIMING)
     error = found.displacement.numpy() - motion.displacement(found.times.numpy())
     error = (error - error.mean((0, 1)))[:, ::16]
