@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -40,15 +40,10 @@ BUILDERS = ("mkdocs", "mkdocstrings", "material", "nbconvert", "latex2mathml", "
 OUTSIDE_DOCS = ("CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md")  # pages that lie at the top level of the project
 
 
-def ordered(names: Iterable[str]) -> list[str]:
-    """Names in the order of ``USED``, others behind."""
-    return sorted(names, key=lambda name: (USED.index(name) if name in USED else len(USED), name))
-
-
 def public_names() -> dict[str, list[str]]:
-    """Public names with their full paths, by package."""
+    """Public names with their full paths, by package, in the order of ``USED``."""
     found: dict[str, list[str]] = defaultdict(list)
-    for name in ordered(rsv.__all__):
+    for name in sorted(rsv.__all__, key=lambda name: (USED.index(name) if name in USED else len(USED), name)):
         thing = getattr(rsv, name)
         found[thing.__module__.split(".")[1]].append(f"{thing.__module__}.{name}")
     return found

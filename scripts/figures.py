@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from benchmarks import live, mosaic
-from benchmarks.finer import EXPOSURE_ROWS, FADE, ROW_TIME, SHAKE, decibel, interpolated
+from benchmarks import finer, live, mosaic
+from benchmarks.finer import EXPOSURE_ROWS, ROW_TIME, decibel
 from benchmarks.finer import MARGIN as FINER_MARGIN
-from benchmarks.independent_camera import ALIASING, POINTS_PER_PX, Array, after_optics, closed, still_image, take_frames
+from benchmarks.independent_camera import POINTS_PER_PX, Array, still_image
 from benchmarks.pipeline import camera
 from kornia.augmentation import AugmentationSequential
 from matplotlib.figure import Figure
@@ -117,7 +117,7 @@ def side_by_side(images: dict[str, Array], height: float) -> Figure:
 def wedge_scene(size: int) -> Array:
     """A city with a wedge of lines that converge from 0.35 to 0.85 cycles per px."""
     side = POINTS_PER_PX * (size + 2 * FINER_MARGIN)
-    scene = closed(city_and_fields(side, side, seed=3).double().numpy(), FADE)
+    scene = city_and_fields(side, side, seed=3).double().numpy()
     row, column = np.meshgrid(np.arange(side), np.arange(side) - side / 2, indexing="ij")
     progress = (row - side / 2 + 160) / 320
     cycles = 0.35 + 0.5 * progress.clip(0, 1)
@@ -129,21 +129,17 @@ def wedge_scene(size: int) -> Array:
 def finer_grid() -> Figure:
     """A wedge beyond the Nyquist frequency of the pixels, from frames of a camera at rest and of a vibrating camera."""
     side, noise, count = 160, 0.002, 8
-    scene, size = after_optics(wedge_scene(side), 0.3), (side, side)
-    timing = rsv.SensorTiming(ROW_TIME, EXPOSURE_ROWS, 2 * side + 59)
-    clean = take_frames(scene, SHAKE, timing, count, size, **ALIASING)
-    generator = np.random.default_rng(1)
-    frames = torch.from_numpy(clean + noise * generator.standard_normal(clean.shape)).float()
-    still = still_image(scene, size) + noise * generator.standard_normal(clean.shape)
-    restored = rsv.restore(frames, timing, rsv.detect_vibration(frames, timing), joint=True, scale=2)[0].numpy()
-    truth = still_image(scene, size, 2)
+    recording = finer.record(wedge_scene(side), 0.3, side)
+    frames = recording.noisy(noise)
     images = {
-        "one still frame, interpolated": interpolated(still[0]),
-        f"mean of {count} still frames, interpolated": interpolated(still.mean(0)),
-        f"{count} vibrating frames, scale=2": restored,
+        "one still frame, interpolated": recording.still(noise, 1),
+        f"mean of {count} still frames, interpolated": recording.still(noise, count),
+        f"{count} vibrating frames, scale=2": finer.joint(
+            frames, recording.timing, rsv.detect_vibration(frames, recording.timing), scale=2
+        ),
     }
-    images = {f"{name}\n{decibel(image, truth):.1f} dB": image for name, image in images.items()}
-    images["scene after optics and pixel"] = truth
+    images = {f"{name}\n{decibel(image, recording.half):.1f} dB": image for name, image in images.items()}
+    images["scene after optics and pixel"] = recording.half
     return side_by_side({name: image[60:-60, 90:-90] for name, image in images.items()}, 4.2)
 
 
@@ -192,7 +188,7 @@ def tracking() -> Figure:
     for place, (quantity, limit) in enumerate((("frequency (Hz)", 0.25), ("amplitude (px)", 0.12))):
         panel = panels[place]
         for axis, (name, colour) in enumerate(zip("xy", COLOURS, strict=True)):
-            error = np.array(values)[:, place, axis] - truth[place][axis]
+            error = np.array(values)[:, place, axis] - truth[place][:, axis]
             deviation = 2 * np.array(stds)[:, place, axis]
             panel.plot(when, error, color=colour, label=name)
             panel.fill_between(when, -deviation, deviation, color=colour, alpha=0.15, linewidth=0)

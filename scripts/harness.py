@@ -2,8 +2,8 @@
 
 A section is a module with
 
-* ``OPTIONS``: its options, by name: the default, the help text, and for values that do not follow from the default
-  their type or their choices. ``QUICK``: values of options that ``--quick`` sets, for a run of seconds;
+* ``OPTIONS``: its options, by name: the default, the help text, and for some the choices. ``QUICK``: values of options
+  that ``--quick`` sets, for a run of seconds;
 * ``rows(options)``: the figures, one dictionary per case, of numbers, texts, lists and dictionaries;
 * ``lines(rows, options)``: the tables in Markdown, without further measurement.
 
@@ -16,23 +16,23 @@ import json
 import math
 import os
 import platform
-import statistics
 import subprocess
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from fractions import Fraction
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 import rsvib_torch as rsv
 
 Rows = list[dict[str, Any]]
-OptionTable = Mapping[str, tuple[Any, ...]]  # default, help text, and for some the type or the choices
+OptionTable = Mapping[str, tuple[Any, ...]]  # default, help text, and for some the choices
 
 RESULTS = Path(__file__).parent / "benchmarks" / "results"
 # Environment variables that must be set before a process starts. PyTorch uses huge pages, as NumPy does by default.
@@ -57,18 +57,16 @@ def with_generated_part(page: str, lines: Iterable[str]) -> str:
 
 def add_options(parser: argparse.ArgumentParser, options: OptionTable) -> None:
     """Add the options of a section; sections that share an option have it from the same table."""
-    for name, (default, text, *kind) in options.items():
-        flag = "--" + name.replace("_", "-")
-        if isinstance(default, bool):
-            parser.add_argument(flag, action="store_true", help=text)
-            continue
-        several = isinstance(default, tuple | list)
-        more: dict[str, Any] = {"nargs": "*"} if several else {}
-        if kind and not isinstance(kind[0], type):
-            more["choices"] = kind[0]
-        else:
-            more["type"] = kind[0] if kind else type(default[0] if several else default)
-        parser.add_argument(flag, default=default, help=f"{text} (default: {default})", **more)
+    for name, (default, text, *choices) in options.items():
+        several = isinstance(default, tuple)
+        parser.add_argument(
+            "--" + name.replace("_", "-"),
+            default=default,
+            help=f"{text} (default: {default})",
+            type=type(default[0] if several else default),
+            choices=choices[0] if choices else None,
+            nargs="*" if several else None,
+        )
 
 
 def devices() -> list[str]:
@@ -77,36 +75,6 @@ def devices() -> list[str]:
 
 
 # Timed runs
-
-
-@dataclass(frozen=True, eq=False)
-class Timed:
-    """Timed runs of a task."""
-
-    result: Any  # return value of the task
-    runs: tuple[float, ...]  # seconds of each run
-
-    @property
-    def seconds(self) -> float:
-        """The median."""
-        return statistics.median(self.runs)
-
-    def __add__(self, other: "Timed") -> "Timed":
-        """Sum of the times of two tasks, run by run; the result is that of the second."""
-        return Timed(other.result, tuple(a + b for a, b in zip(self.runs, other.runs, strict=True)))
-
-    def scaled(self, factor: float) -> "Timed":
-        """Times multiplied by a factor."""
-        return Timed(self.result, tuple(factor * seconds for seconds in self.runs))
-
-    def figures(self) -> dict[str, float]:
-        """Median, shortest and longest time."""
-        return {"seconds": self.seconds, "seconds_least": min(self.runs), "seconds_most": max(self.runs)}
-
-
-def shown_seconds(row: dict[str, Any]) -> str:
-    """Median and range of ``Timed.figures`` as a cell of a table."""
-    return f"{row['seconds']:.3f} ({row['seconds_least']:.3f} to {row['seconds_most']:.3f})"
 
 
 def finish() -> None:
@@ -135,19 +103,12 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def in_turns(works: dict[str, Callable[[], Any]], runs: int) -> dict[str, Timed]:
-    """Timed runs of each task; the tasks alternate, so that other load on the machine affects all of them equally."""
-    results = {name: work() for name, work in works.items()}  # warm-up
-    seconds: dict[str, list[float]] = {name: [] for name in works}
-    for _ in range(max(1, runs)):
-        for name, work in works.items():
-            seconds[name].append(seconds_of(work))
-    return {name: Timed(results[name], tuple(seconds[name])) for name in works}
-
-
-def named(name: str, device: str) -> str:
-    """Name of a task on a device."""
-    return name if device == "cpu" else f"{name} on {device}"
+def in_turns(works: dict[str, Callable[[], Any]], runs: int) -> dict[str, NDArray[np.float64]]:
+    """Seconds of the runs of each task; they alternate, so that other load on the machine affects all tasks equally."""
+    for work in works.values():  # warm-up
+        work()
+    rounds = [[seconds_of(work) for work in works.values()] for _ in range(max(1, runs))]
+    return dict(zip(works, np.transpose(rounds), strict=True))
 
 
 def plain_environment() -> dict[str, str]:

@@ -9,13 +9,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from benchmarks.independent_camera import Array, exposed
 from scipy.ndimage import map_coordinates, spline_filter
 from scipy.spatial.transform import Rotation
 
 from rsvib_torch import SensorTiming, Vibration
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -68,23 +66,26 @@ class LensMotion(FieldMotion):
         return seen[..., 0], seen[..., 1]
 
 
+def pixel_starts(timing: SensorTiming, size: tuple[int, int], num_frames: int) -> Array:
+    """Exposure starts (T, H, W) of pixels in image orientation, s."""
+    lines = size[timing.scan_axis]
+    line = np.arange(lines)[:: -1 if timing.readout_direction == "reverse" else 1]
+    of_line = np.broadcast_to(line[:, None] if timing.scan_axis == -2 else line, size)
+    return np.arange(num_frames)[:, None, None] * timing.frame_period + of_line * timing.row_time
+
+
 def take_field_frames(
     scene: Array, timing: SensorTiming, motion: FieldMotion, size: tuple[int, int], num_frames: int = 2, nodes: int = 6
 ) -> Array:
     """Frames (T, H, W) in image orientation, centred on the scene."""
-    height, width = size
-    top, left = ((whole - part) / 2 for whole, part in zip(scene.shape, size, strict=True))
+    middle = [(length - 1) / 2 for length in scene.shape]
     coefficients = spline_filter(scene, 5)
-    row, column = np.mgrid[:height, :width].astype(float)
-    line, lines = (row, height) if timing.scan_axis == -2 else (column, width)
-    line = lines - 1 - line if timing.readout_direction == "reverse" else line
-    moments, weights = np.polynomial.legendre.leggauss(nodes)
-    frames = np.zeros((num_frames, height, width))
-    for frame in range(num_frames):
-        starts = frame * timing.frame_period + line * timing.row_time
-        for moment, weight in zip(0.5 * (moments + 1), 0.5 * weights, strict=True):
-            times = starts + moment * timing.exposure_time
-            seen_x, seen_y = motion.seen(column - 0.5 * (width - 1), row - 0.5 * (height - 1), times)
-            places = [seen_y + 0.5 * (height - 1) + top, seen_x + 0.5 * (width - 1) + left]
-            frames[frame] += weight * map_coordinates(coefficients, places, order=5, prefilter=False, mode="mirror")
-    return frames
+    down, right = np.mgrid[: size[0], : size[1]] - (np.array(size)[:, None, None] - 1) / 2
+
+    def seen_at(times: Array) -> Array:
+        x, y = motion.seen(right, down, times)
+        places = [y + middle[0], x + middle[1]]
+        return map_coordinates(coefficients, places, order=5, prefilter=False, mode="mirror")
+
+    starts = pixel_starts(timing, size, num_frames)
+    return np.stack([exposed(seen_at, of_frame, timing.exposure_time, nodes) for of_frame in starts])

@@ -8,35 +8,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from benchmarks.independent_camera import (
-    ALIASING,
-    Array,
-    Shake,
-    after_optics,
-    closed,
-    mosaic_of,
-    still_image,
-    take_frames,
-)
 from benchmarks.independent_camera import POINTS_PER_PX as FINER
+from benchmarks.independent_camera import Array, Shake, take_frames
 from torch import Tensor
 
 import rsvib_torch as rsv
-
-__all__ = [
-    "FINER",
-    "SHAKE",
-    "TIMING",
-    "VIBRATION",
-    "Shake",
-    "after_optics",
-    "check_gradient",
-    "closed",
-    "mosaic_of",
-    "noisy",
-    "still_image",
-    "taken",
-]
 
 SHAKE = Shake(np.array([[3.1], [5.2]]), np.array([[90.0], [61.0]]), np.array([[0.4], [1.3]]), np.zeros(2))
 VIBRATION = rsv.Vibration([3.1, 5.2], [90.0, 61.0], [0.4, 1.3])
@@ -45,7 +21,7 @@ TIMING = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=571)
 
 def taken(scene: Array, count: int, size: int, shake: Shake = SHAKE) -> Array:
     """Noise-free frames (T, size, size) of a scene on the grid of the camera."""
-    return take_frames(scene, shake, TIMING, count, (size, size), **ALIASING)
+    return take_frames(scene, shake, TIMING, count, (size, size), points=FINER)
 
 
 def noisy(clean: Array, noise: float, seed: int = 1) -> Tensor:

@@ -1,10 +1,10 @@
 """A pinhole camera that turns, apart from the package: frames of a distant scene, and the rates of a gyroscope."""
 
-import itertools
-
 import cv2
 import numpy as np
 import torch
+from benchmarks.independent_camera import exposed
+from field_truth import pixel_starts
 from scipy.ndimage import map_coordinates, spline_filter
 from scipy.spatial.transform import Rotation
 from truth import draw_scene
@@ -42,26 +42,26 @@ def take(timing, size=1.0, *, noise=0.003, dashboard=0, subject=None, count=COUN
     """
     height, width = SIZE
     scene = draw_scene(height + 60, width + 60, 5)
+    middle = (np.array(scene.shape[::-1]) - 1) / 2
     coefficients = spline_filter(scene, 5)
     row, column = np.mgrid[:height, :width].astype(float)
-    line, lines = (row, height) if timing.scan_axis == -2 else (column, width)
-    line = lines - 1 - line if timing.readout_direction == "reverse" else line
     ray = np.stack([column - (width - 1) / 2, row - (height - 1) / 2, np.full_like(row, FOCAL_LENGTH)], -1)
     if fisheye is not None:
         normal = cv2.fisheye.undistortPoints(ray[..., :2].reshape(-1, 1, 2) / FOCAL_LENGTH, np.eye(3), fisheye)
         ray[..., :2] = FOCAL_LENGTH * normal.reshape(height, width, 2)
-    frames = np.zeros((count, height, width))
-    nodes, weights = np.polynomial.legendre.leggauss(3)
-    for frame, (node, weight) in itertools.product(range(count), zip(nodes, weights, strict=True)):
-        times = frame * timing.frame_period + line * timing.row_time + (node + 1) / 2 * timing.exposure_time
+
+    def seen_at(times):
         seen = attitude(times.ravel(), size).apply(ray.reshape(-1, 3)).reshape(ray.shape)
-        seen = FOCAL_LENGTH * seen[..., :2] / seen[..., 2:] + (np.array(scene.shape[::-1]) - 1) / 2
+        seen = FOCAL_LENGTH * seen[..., :2] / seen[..., 2:] + middle
         image = map_coordinates(coefficients, [seen[..., 1], seen[..., 0]], order=5, prefilter=False)
         if subject is not None:
             place = seen - subject(times.ravel()).reshape(seen.shape)
             inside = (np.abs(place - np.array(scene.shape[::-1]) / 2 - [0, 20]) < [95, 70]).all(-1)
             image[inside] = map_coordinates(draw_scene(*scene.shape, 8), place[inside].T[::-1], order=3)
-        frames[frame] += weight / 2 * image
+        return image
+
+    starts = pixel_starts(timing, SIZE, count)
+    frames = np.stack([exposed(seen_at, of_frame, timing.exposure_time, 3) for of_frame in starts])
     if dashboard:
         frames[:, -dashboard:] = draw_scene(dashboard, width, 9)
     frames += noise * np.random.default_rng(1).standard_normal(frames.shape)

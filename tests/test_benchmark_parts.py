@@ -8,8 +8,6 @@ import benchmark
 import pytest
 import torch
 from benchmark import SECTIONS, module_of
-from benchmark_options import defaults
-from benchmarks import pipeline
 from harness import read_result, write_result
 
 import rsvib_torch as rsv
@@ -28,7 +26,8 @@ def test_sections_have_quick_options_of_the_same_names(name):
 
 def test_results_are_stored_and_read_back(tmp_path):
     rows = [{"name": "a", "values": [1.5, -math.inf, None], "error": math.nan, "pair": (2, "x")}]
-    chosen = defaults(pipeline, out=tmp_path, scenes=[Path("scene.png")])
+    chosen = benchmark.parsed(["--only", "pipeline", "--quick", "--out", str(tmp_path)])
+    chosen.scenes = [Path("scene.png")]
     path = write_result("pipeline", rows, chosen, 12.34, tmp_path)
     text = path.read_text()
     assert "NaN" not in text

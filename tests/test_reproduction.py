@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from benchmark_options import defaults
+from benchmark import parsed
 from benchmarks import reproduction
 from benchmarks.reproduction import AMPLITUDE, DETECTED, PERIOD, RESTORED, crossing, straight_edge_mtf
 from edge_truth import draw_edge, gaussian, through_pixels
@@ -36,7 +36,7 @@ def test_percentages_of_the_paper_agree_with_its_values():
 
 
 def test_small_run():
-    options = defaults(reproduction)
+    options = parsed(["--only", "reproduction", "--quick"])
     results = reproduction.rows(options)
     found = reproduction.chosen(results, part="detection", method=reproduction.DEFAULT)
     assert len(found) == 4

@@ -1,7 +1,6 @@
 """Ground truth for tests, independent of the package: scenes, motion and frames in NumPy float64.
 
-Displacement along rows is a Fourier shift of a scene larger than the frame, displacement across rows a quintic spline
-with the prefilter of SciPy, and the exposure a sum over Gauss-Legendre nodes.
+The camera is that of ``scripts/benchmarks/independent_camera.py``.
 """
 
 from collections.abc import Callable
@@ -10,14 +9,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
-from scipy import ndimage, sparse
-from scipy.interpolate import BSpline
+from benchmarks import independent_camera
+from benchmarks.independent_camera import Array
+from scipy import ndimage
 from torch import Tensor
 
 from rsvib_torch import SensorTiming, Vibration
 
-Array = NDArray[np.float64]
 MARGIN = 40
 
 
@@ -79,30 +77,7 @@ def take_frames(
 ) -> Array:
     """Frames (T, H, W) of the centred part of the scene, ``margin`` px smaller on every side."""
     height, width = (size - 2 * margin for size in scene.shape)
-    spectra = np.fft.rfft(ndimage.spline_filter1d(scene, order=5, axis=0, mode="mirror"), axis=1)
-    fine, coarse = (np.arange(*steps) / scene.shape[1] for steps in ((16,), (0, spectra.shape[1], 16)))
-    basis = BSpline.basis_element(np.arange(7) - 3.0, extrapolate=False)
-    rows = np.arange(height)
-    frames = np.zeros((num_frames, height, width))
-    for p in range(num_frames):
-        starts = (p * timing.frame_rows + rows) * timing.row_time
-        # the longest path of a row: detail of half a cycle per px turns by pi per px of it
-        path = motion.displacement((starts + np.linspace(0, timing.exposure_time, 9)[:, None]).ravel())
-        length = np.abs(np.diff(path.reshape(9, height, 2), axis=0)).sum((0, 2)).max()
-        total = np.zeros((height, spectra.shape[1]), dtype=complex)
-        for node, share in zip(*np.polynomial.legendre.leggauss(6 + int(2 * length)), strict=True):
-            x, y = motion.displacement(starts + 0.5 * (1 + node) * timing.exposure_time).T
-            # across the rows: six taps of the spline
-            place = (rows + margin - y)[:, None]
-            taps = np.floor(place).astype(int) - 2 + np.arange(6)
-            weights = 0.5 * share * np.nan_to_num(basis(place - taps))
-            taps = np.clip(taps, 0, scene.shape[0] - 1)
-            moved = sparse.csr_array((weights.ravel(), taps.ravel(), 6 * np.arange(height + 1)), (height, len(scene)))
-            # along the rows: phase factors of all frequencies as products of those of two short lists
-            turn = -2j * np.pi * x[:, None]
-            factors = np.exp(turn * coarse)[..., None] * np.exp(turn * fine)[:, None]
-            total += (moved @ spectra) * factors.reshape(height, -1)[:, : spectra.shape[1]]
-        frames[p] = np.fft.irfft(total, n=scene.shape[1], axis=1)[:, margin : margin + width]
+    frames = independent_camera.take_frames(scene, motion, timing, num_frames, (height, width), between=1)
     return frames + noise * np.random.default_rng(seed).standard_normal(frames.shape)
 
 

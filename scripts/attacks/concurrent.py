@@ -1,13 +1,12 @@
 """Several processes write the same output at once, while others read it."""
 
 import random
-import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from attacks.small_runs import FORMATS, Child, Reference, completed_or_refused, content, process
+from attacks.small_runs import FORMATS, Child, Reference, completed_or_refused, content, in_turn, process
 from attacks.trial import Trial
 
 # one file, which is replaced
@@ -22,11 +21,8 @@ def _run(source: Path, sink: Path, options: dict[str, Any], delay: float) -> Non
 def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
     """Three processes per trial, with random delays; the first trial of a format has no output before."""
     reference, choice = Reference(folder / "reference"), random.Random(seed)
-    for number in range(count):
-        kind = list(FORMATS)[number % len(FORMATS)]
+    for _, kind, place in in_turn(folder, count):
         name, options = FORMATS[kind]
-        place = folder / "trial"
-        place.mkdir()
         whole = content(reference.whole / name)
         delays = [choice.uniform(0.0, 0.3) for _ in range(3)]
         children = [Child(_run, reference.source, place / name, options, delay) for delay in delays]
@@ -41,4 +37,3 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
         found = {one.outcome: one for one in (completed_or_refused(title, *end, difference) for end in ends)}
         worst = next((found[one] for one in ("hang", "traceback", "wrong", "completed") if one in found), None)
         yield worst or Trial(title, "wrong", f"no run succeeded: {ends}")
-        shutil.rmtree(place)

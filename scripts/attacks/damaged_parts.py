@@ -1,11 +1,10 @@
 """After a kill, a file of the work folder is damaged: the result of the resumed run must be complete nevertheless."""
 
 import random
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from attacks.small_runs import FORMATS, Reference, kill_run, resumed_trial
+from attacks.small_runs import FORMATS, Reference, in_turn, kill_run, resumed_trial
 from attacks.trial import Trial
 
 _DAMAGES = ("deleted", "truncated", "emptied", "zeroed", "bit flipped", "swapped", "extended")
@@ -44,10 +43,8 @@ def _damage(file: Path, others: list[Path], kind: str, choice: random.Random) ->
 def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
     """Formats and kinds of damage take turns."""
     reference, choice = Reference(folder / "reference"), random.Random(seed)
-    for number in range(count):
-        kind = list(FORMATS)[number % len(FORMATS)]
+    for number, kind, place in in_turn(folder, count):
         damage = _DAMAGES[number // len(FORMATS) % len(_DAMAGES)]
-        place = folder / "trial"
         work = place / f".{FORMATS[kind][0]}.rsvib"
         files: list[Path] = []
         while not files:
@@ -56,4 +53,3 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
         file = choice.choice(files)
         where = _damage(file, [other for other in files if other != file], damage, choice)
         yield resumed_trial(reference, place, kind, f"{kind}: {file.relative_to(work)} {damage}{where}")
-        shutil.rmtree(place)

@@ -7,6 +7,7 @@ unless the frames are without noise, as none of a sensor are.
 import random
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import torch
 from attacks.files import TIMING
@@ -48,17 +49,15 @@ _CHANGES: dict[str, Callable[[Tensor], Tensor]] = {
 }
 
 
-def _name(item: int) -> str:
+def _drawn(item: int) -> tuple[random.Random, str, str, Callable[..., Any]]:
+    """Random numbers of a trial, its image and change, and the function that is called."""
     choice = random.Random(item)
-    kind, change = list(_IMAGES)[item % len(_IMAGES)], choice.choice(list(_CHANGES))
-    return f"{choice.choice(_FUNCTIONS).__name__}, {kind}{change}, seed {item}"
+    return choice, list(_IMAGES)[item % len(_IMAGES)], choice.choice(list(_CHANGES)), choice.choice(_FUNCTIONS)
 
 
 def attempt(folder: Path, item: int) -> str:
     """Four frames and one function."""
-    choice = random.Random(item)
-    kind = list(_IMAGES)[item % len(_IMAGES)]
-    change, function = choice.choice(list(_CHANGES)), choice.choice(_FUNCTIONS)
+    choice, kind, change, function = _drawn(item)
     torch.manual_seed(item)
     number, dy, dx = choice.randrange(1000), choice.randint(-3, 3), choice.randint(-3, 3)
     rows, columns = torch.arange(_SIZE)[:, None], torch.arange(_SIZE)
@@ -83,5 +82,8 @@ def attempt(folder: Path, item: int) -> str:
 
 def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
     """The images in turn; motion, change and function are random."""
-    items = range(seed * 10**6, seed * 10**6 + count)
-    yield from in_warm_child(attempt, zip(map(_name, items), items, strict=True), folder)
+    items = []
+    for item in range(seed * 10**6, seed * 10**6 + count):
+        _, kind, change, function = _drawn(item)
+        items.append((f"{function.__name__}, {kind}{change}, seed {item}", item))
+    yield from in_warm_child(attempt, items, folder)

@@ -1,7 +1,6 @@
 """Runs are killed at random calls and times, and resumed: the result must be that of an uninterrupted run."""
 
 import random
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from attacks.small_runs import (
     counted_run,
     finished_windows,
     fork,
+    in_turn,
     resumed_trial,
 )
 from attacks.trial import Trial
@@ -24,11 +24,8 @@ _LONGEST = 0.6  # s; a run takes 0.2 to 0.5 s on an idle core
 def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
     """Every other trial is killed at a random call, the others at a random time; every third is killed twice."""
     reference, choice = Reference(folder / "reference"), random.Random(seed)
-    for number in range(count):
-        kind = list(FORMATS)[number % len(FORMATS)]
+    for number, kind, place in in_turn(folder, count):
         name, options = FORMATS[kind]
-        place = folder / "trial"
-        place.mkdir()
         moments, arguments = [], (reference.source, place / name, {**options, "resume": True})
         for _ in range(2 if number % 3 == 0 else 1):
             if number % 2:
@@ -44,4 +41,3 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
             yield Trial(title, "wrong", "an incomplete output has its name")
         else:
             yield resumed_trial(reference, place, kind, title, finished_windows(place, name))
-        shutil.rmtree(place)

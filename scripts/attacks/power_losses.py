@@ -10,7 +10,6 @@ names, and parts of the content.
 import json
 import os
 import random
-import shutil
 import stat
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,6 +23,7 @@ from attacks.small_runs import (
     count_file_calls,
     finished_windows,
     fork,
+    in_turn,
     process,
     resumed_trial,
 )
@@ -117,10 +117,9 @@ class _PowerLoss:
 def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
     """The formats take turns."""
     reference, choice = Reference(folder / "reference"), random.Random(seed)
-    for number in range(count):
-        kind = list(FORMATS)[number % len(FORMATS)]
+    for number, kind, place in in_turn(folder, count):
         name, options = FORMATS[kind]
-        root, records, after = folder / "disk", folder / "records", folder / "after"
+        root, records, after = place / "disk", place / "records", place / "after"
         for path in (root, records):
             path.mkdir()
         call, mixed = choice.randint(1, calls_of(reference, kind)), bool(number // len(FORMATS) % 2)
@@ -132,5 +131,3 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
             _PowerLoss(root, records, choice if mixed else None).build(root.stat().st_ino, root, after)
             finished = min(finished_windows(after / "new", name), WINDOWS)
             yield resumed_trial(reference, after / "new", kind, title, finished)
-        for path in (root, records, after):
-            shutil.rmtree(path, ignore_errors=True)

@@ -13,7 +13,7 @@ import shutil
 import signal
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -207,6 +207,15 @@ def resume(source: Path, sink: Path, options: dict[str, Any]) -> int:
     """Resume a run; returns the number of windows that were complete before."""
     resumed: int = process(source, sink, resume=True, **options).resumed
     return resumed
+
+
+def in_turn(folder: Path, count: int) -> Iterator[tuple[int, str, Path]]:
+    """Numbers of trials, formats that take turns, and an empty folder, which is removed after the trial."""
+    place = folder / "trial"
+    for number, kind in zip(range(count), itertools.cycle(FORMATS), strict=False):
+        place.mkdir()
+        yield number, kind, place
+        shutil.rmtree(place)
 
 
 @functools.cache

@@ -1,5 +1,6 @@
 """The result of one trial of an attack, and how a child process is watched."""
 
+import contextlib
 import subprocess
 import sys
 import time
@@ -39,16 +40,6 @@ class Process:
     peak_memory: int
 
 
-def _memory_of_tree(process: psutil.Process) -> int:
-    total = 0
-    for member in [process, *process.children(recursive=True)]:
-        try:
-            total += member.memory_info().rss
-        except psutil.NoSuchProcess:  # ended since it was listed
-            continue
-    return total
-
-
 def run_watched(command: Sequence[str], *, limit: float, folder: Path) -> Process:
     """Run a command in a folder and measure the peak resident memory of its process tree.
 
@@ -60,12 +51,11 @@ def run_watched(command: Sequence[str], *, limit: float, folder: Path) -> Proces
         child = subprocess.Popen(command, cwd=folder, stdout=output, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL)
         tree, peak = psutil.Process(child.pid), 0
         while child.poll() is None and time.perf_counter() - begin < limit:
-            try:
-                peak = max(peak, _memory_of_tree(tree))
-            except psutil.NoSuchProcess:
-                break
+            with contextlib.suppress(psutil.NoSuchProcess):  # of a process that has ended since it was listed
+                processes = [tree, *tree.children(recursive=True)]
+                peak = max(peak, sum(member.memory_info().rss for member in processes))
             time.sleep(0.02)
-        expired = child.poll() is None and time.perf_counter() - begin >= limit
+        expired = child.poll() is None
         if expired:
             for member in [*tree.children(recursive=True), tree]:
                 member.kill()

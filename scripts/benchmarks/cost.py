@@ -71,14 +71,13 @@ def measure(difficult: Recorded, simple: Recorded, runs: int) -> dict[str, Any]:
         works[f"{kind}restoration"] = partial(rsv.restore, *recorded, found)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", rsv.RestorationWarning)
-        least = {name: min(timed.runs) for name, timed in in_turns(works, runs).items()}
+        least = {name: float(seconds.min()) for name, seconds in in_turns(works, runs).items()}
     ratios = {f"{step}_ratio": least[step] / least[f"plain_{step}"] for step in ("detection", "restoration")}
     codes = [reason.code for of_axis in found.findings for reason in of_axis]
     return {"shape": list(difficult[0].shape), **least, **ratios, "reason": codes[0] if codes else ""}
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    """Times of all difficult inputs."""
     size, results = options.cost_size, []
     inputs = [(kind, name, number) for kind, classes in OF_CLASSES.items() for name, number in classes]
     for kind, name, number in inputs[: options.cost_inputs]:

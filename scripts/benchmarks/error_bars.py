@@ -19,7 +19,7 @@ import argparse
 import math
 import sys
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -49,11 +49,10 @@ from truth import Curve, draw_scene, take_frames  # noqa: E402
 
 Array = NDArray[np.float64]
 Error = tuple[str, float, float, float]  # quantity, error, standard deviation, bound or NaN
-Recorded = tuple[torch.Tensor, rsv.SensorTiming, rsv.Vibration, rsv.VibrationStd | None]  # frames, truth, its bound
 TIMING = rsv.SensorTiming(row_time=6e-5, exposure_rows=20, frame_rows=270)
 FRAMES, ROWS, COLUMNS, NOISE, RIM = 5, 192, 160, 0.005, 12
 TONES = {"tone, 2 frames": 2, "tone, 4 frames": 4, "tone, 8 frames": 8}
-TURNS = {"roll, 4 frames": "roll", "zoom, 4 frames": "zoom"}
+TURNS = {"roll, 4 frames": ("roll",), "zoom, 4 frames": ("roll", "zoom")}
 TRACKED = "tracker, 12 frames"
 FOLLOWED = {"followed: decay, 16 frames": (3.0, 0.0), "followed: sweep, 16 frames": (0.0, 3.0)}  # largest 1/s, Hz/s
 FIXED = {  # amplitudes (px, px, rad, 1) and frequencies of the axes
@@ -65,8 +64,7 @@ FIXED = {  # amplitudes (px, px, rad, 1) and frequencies of the axes
     "roll with the frequency of x": ((3.0, 5.0, 1e-3), (70.0, 61.0, 70.0)),
     "roll 1 mrad, zoom 5e-4": ((3.0, 5.0, 1e-3, 5e-4), (90.0, 61.0, 70.0, 53.0)),
 }
-FREE = {"free motion: walk": "walk", "free motion: smooth": "smooth", "free motion: tones": "tones"}
-FREE |= {"free motion: nearly blind": "blind"}
+FREE = tuple(f"free motion: {kind}" for kind in ("walk", "smooth", "tones", "nearly blind"))
 CALIBRATIONS = ("wall", "noisy wall", "textured", "weakly textured", "textured, four frames")
 BY_MOTION: dict[str, tuple[Any, Any, Any, Any]] = {  # amplitudes, frequencies, limits of the row time, and direction
     "row time by motion: 83 Hz along x, known to 12 %": (((3.0,), (0.0,)), ((83.0,), (1.0,)), (0.88, 1.12), "forward"),
@@ -101,25 +99,19 @@ def one_tone(generator: Generator, low: float, high: float) -> Array:
     return tones_of(generator, log_uniform(generator, low, high).tolist(), [turns / FRAME_PERIOD])
 
 
-def pixels_at_rest(layer: Layer, size: int, rim: int = 32) -> torch.Tensor:
-    """Pixels of a scene at rest, ``rim`` px larger on each side than the frame."""
-    place = FINER * (np.arange(-rim, size + rim) + MARGIN + 0.5)  # as in honesty_camera.take_frames
-    grid = np.meshgrid(place, place, indexing="ij")
-    return torch.from_numpy(map_coordinates(layer.light, grid, np.float64, prefilter=False))
-
-
 def bound_of(layer: Layer, timing: rsv.SensorTiming, true: rsv.Vibration, frames: int, noise: float, size: int) -> Any:
-    """The bound of a random scene."""
-    options = {"noise": noise, "frame_size": (size, size), "method": "random"}
-    return cramer_rao_bound(pixels_at_rest(layer, size), timing, true, frames, **options)
+    """The bound of a random scene, which is known 32 px beyond the frame on each side."""
+    place = FINER * (np.arange(-32, size + 32) + MARGIN + 0.5)  # as in honesty_camera.take_frames
+    grid = np.meshgrid(place, place, indexing="ij")
+    still = torch.from_numpy(map_coordinates(layer.light, grid, np.float64, prefilter=False))
+    return cramer_rao_bound(still, timing, true, frames, noise=noise, frame_size=(size, size), method="random")
 
 
-def random_tones(kind: str, number: int, size: int) -> Recorded:
-    """A recording with one tone of each axis, also of roll or zoom."""
-    generator, what = generator_of(kind, number), TURNS.get(kind)
+def random_tones(kind: str, number: int, size: int) -> tuple[torch.Tensor, rsv.SensorTiming, rsv.Vibration, Any]:
+    """A recording with one tone of each axis, also of roll or zoom: frames, timing, true vibration, and its bound."""
+    generator = generator_of(kind, number)
     parts = [one_tone(generator, 0.3, 4.0) for _ in range(2)]
-    turns = {"roll": ("roll",), "zoom": ("roll", "zoom")}.get(what or "", ())
-    turn = {name: one_tone(generator, 0.2 / (0.5 * size), 2.0 / (0.5 * size)) for name in turns}
+    turn = {name: one_tone(generator, 0.2 / (0.5 * size), 2.0 / (0.5 * size)) for name in TURNS.get(kind, ())}
     case = Case(
         moving(*(partial(wave, part) for part in parts), **turn),
         None,
@@ -180,6 +172,13 @@ def tones(kind: str, number: int, size: int) -> Iterator[Error]:
             yield f"{name} {quantity}", error, std, least
 
 
+def recorded(motion: Curve, count: int, draw: Generator) -> torch.Tensor:
+    """Frames of a drawn scene with noise."""
+    scene = draw_scene(ROWS + 80, COLUMNS + 80, int(draw.integers(1000)))
+    clean = take_frames(scene, TIMING, motion, count)
+    return torch.from_numpy(clean + NOISE * draw.standard_normal(clean.shape)).float()
+
+
 def followed(kind: str, number: int) -> Iterator[Error]:
     """Errors at every fifth frame of a tone of each axis that decays or sweeps, and of the rows, rms over the rows."""
     draw = generator_of(kind, number)
@@ -190,10 +189,7 @@ def followed(kind: str, number: int) -> Iterator[Error]:
         turns = (tone[:, 1] * FRAME_PERIOD / TIMING.frame_period + 0.5 * sweep * times[..., None]) * times[..., None]
         return tone[:, 0] * np.exp(-decay * times[..., None]) * np.sin(2 * np.pi * turns + tone[:, 2])
 
-    scene = draw_scene(ROWS + 80, COLUMNS + 80, int(draw.integers(1000)))
-    clean = take_frames(scene, TIMING, Curve(moved), 16, 0.0)
-    noisy = torch.from_numpy(clean + NOISE * draw.standard_normal(clean.shape)).float()
-    found = rsv.follow_vibration(noisy, TIMING)
+    found = rsv.follow_vibration(recorded(Curve(moved), 16, draw), TIMING)
     moments = TIMING.row_starts(16, ROWS) + 0.5 * TIMING.exposure_time
     for frame in range(0, 16, 5):
         shown, middle = found.vibration[frame], float(moments[frame].mean())
@@ -234,9 +230,8 @@ def drawn(kind: str, draw: Generator) -> Curve:
 def free_motion(kind: str, number: int) -> Iterator[Error]:
     """Errors of the displacement of the rows of each axis, rms over the rows, and of what differs between frames."""
     draw = generator_of(kind, number)
-    motion = drawn(FREE[kind], draw)
-    clean = take_frames(draw_scene(ROWS + 80, COLUMNS + 80, int(draw.integers(1000))), TIMING, motion, FRAMES, 0.0)
-    found = rsv.detect_motion(torch.from_numpy(clean + NOISE * draw.standard_normal(clean.shape)).float(), TIMING)
+    motion = drawn(kind.removeprefix("free motion: "), draw)
+    found = rsv.detect_motion(recorded(motion, FRAMES, draw), TIMING)
     error = found.displacement.numpy() - motion.displacement(found.times.numpy())
     error = (error - error.mean((0, 1)))[:, ::16]
     for value, std in zip(error.ravel(), found.std.numpy()[:, ::16].ravel(), strict=True):
@@ -320,20 +315,18 @@ def by_motion(kind: str, number: int, size: int) -> Iterator[Error]:
 # The table
 
 
-def errors_of(kind: str, number: int, size: int) -> list[Error]:
+def errors_of(kind: str, number: int, size: int) -> Iterator[Error]:
     """All errors of a recording."""
     if kind in FREE:
-        return list(free_motion(kind, number))
+        return free_motion(kind, number)
     if kind in FOLLOWED:
-        return list(followed(kind, number))
+        return followed(kind, number)
     if kind.startswith("row time: "):
-        return list(calibration(kind, number))
-    measure: Callable[[str, int, int], Iterator[Error]] = by_motion if kind in BY_MOTION else tones
-    return list(measure(kind, number, size))
+        return calibration(kind, number)
+    return by_motion(kind, number, size) if kind in BY_MOTION else tones(kind, number, size)
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    """The figures of each quantity of each kind."""
     figures: Rows = []
     with one_thread():
         for kind in options.bar_kinds:
@@ -357,7 +350,6 @@ WITHIN = {"68": 1.0, "95": 1.96, "99.7": 3.0}
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:
-    """The figures as a Markdown table."""
     heads = ("recordings", "quantity", "values", "rms of z", *(f"{share} %" for share in WITHIN), "largest z")
     ratios = {"median of std / bound": "std_over_bound", "rms of error / bound": "error_over_bound"}
     cells = []

@@ -10,13 +10,14 @@ import argparse
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 from benchmarks import honesty_camera
+from benchmarks.honesty_cases import moving, wave
 from benchmarks.independent_camera import (
-    ALIASING,
     POINTS_PER_PX,
     Array,
     Shake,
@@ -101,7 +102,7 @@ def record(
     scene, shape = after_optics(closed(fine, FADE), sigma), (size, size)
     timing = rsv.SensorTiming(ROW_TIME, exposure, max(2 * size + 59, exposure + 59))
     shake = replace(SHAKE, image_motion=np.array([image_motion, 0.0]))
-    frames = take_frames(scene, shake, timing, max(FRAMES), shape, **ALIASING)
+    frames = take_frames(scene, shake, timing, max(FRAMES), shape, points=POINTS_PER_PX)
     vibration = rsv.Vibration(
         *(torch.from_numpy(v) for v in (SHAKE.amplitude, SHAKE.frequency, SHAKE.phase)), shake.image_motion
     )
@@ -112,14 +113,10 @@ def record(
 
 def rolling(fine: Array, size: int, roll: float) -> Recording:
     """Frames of a camera that also rolls."""
-    amplitude, frequency, phase = np.array([3.1, 5.2, roll]), np.array([90.0, 61.0, 70.0]), np.array([0.4, 1.3, 2.0])
+    tones = np.array([[3.1, 90.0, 0.4], [5.2, 61.0, 1.3], [roll, 70.0, 2.0]])
+    motion = moving(partial(wave, tones[:1]), partial(wave, tones[1:2]), tones[2:])
     layers = [honesty_camera.layer(fine)]
     timing = rsv.SensorTiming(ROW_TIME, EXPOSURE_ROWS, 2 * size + 59)
-
-    def motion(times: Array) -> Array:
-        tones = [a * np.sin(2 * np.pi * f * times + p) for a, f, p in zip(amplitude, frequency, phase, strict=True)]
-        return np.stack([*tones, np.zeros(times.shape)])
-
     starts = np.arange(max(FRAMES))[:, None] * timing.frame_period + np.arange(size) * ROW_TIME
     frames = honesty_camera.take_frames(layers, motion, starts, timing.exposure_time, size)
     half = np.empty((2 * size, 2 * size))
@@ -127,7 +124,7 @@ def rolling(fine: Array, size: int, roll: float) -> Recording:
         for right in (0, 1):
             standing = honesty_camera.standing(-0.5 * right, -0.5 * down)
             half[down::2, right::2] = honesty_camera.take_frames(layers, standing, starts[:1], 1e-9, size)[0]
-    return Recording(frames, half, timing, rsv.Vibration(amplitude, frequency, phase))
+    return Recording(frames, half, timing, rsv.Vibration(*tones.T))
 
 
 def places(frames: torch.Tensor, timing: rsv.SensorTiming, vibration: rsv.Vibration) -> tuple[Array, Array]:
@@ -269,7 +266,6 @@ def rows(options: argparse.Namespace) -> Rows:
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:
-    """Tables of the scenes and of the conditions."""
     return [
         f"PSNR in dB against the noise-free scene after optics and pixel, without a border of {RIM} points; frames of "
         f"{options.finer_size} x {options.finer_size} px, exposure of {EXPOSURE_ROWS} rows, vibration detected in all "

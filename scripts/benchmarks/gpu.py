@@ -14,13 +14,15 @@ import itertools
 import statistics
 import time
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
+import numpy as np
 import torch
 from harness import Rows, devices, finish, in_turns, seconds_of, table
 from torch import Tensor
+from torch.utils import _pytree as pytree
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import rsvib_torch as rsv
@@ -52,7 +54,7 @@ class Count(TorchDispatchMode):
     def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Run an operation and count it."""
         result = function(*args, **(kwargs or {}))
-        given, made = _tensors((*args, *(kwargs or {}).values())), _tensors((result,))
+        given, made = _tensors((args, kwargs)), _tensors(result)
         name = function.overloadpacket.__name__
         self.operations += 1
         if name in WAITS:
@@ -65,15 +67,9 @@ class Count(TorchDispatchMode):
         return result
 
 
-def _tensors(values: Iterable[Any]) -> list[Tensor]:
-    """Tensors among values and in lists of them."""
-    found = []
-    for value in values:
-        if isinstance(value, Tensor):
-            found.append(value)
-        elif isinstance(value, list | tuple):
-            found += [part for part in value if isinstance(part, Tensor)]
-    return found
+def _tensors(values: Any) -> list[Tensor]:
+    """Tensors in nested sequences and dictionaries."""
+    return [value for value in pytree.tree_leaves(values) if isinstance(value, Tensor)]
 
 
 def _place(value: Tensor) -> int:
@@ -150,7 +146,7 @@ def bandwidth(device: str) -> float:
     """Bytes read and written per second when a device copies memory."""
     source = torch.ones(COPIED // 4, device=device)
     target = torch.empty_like(source)
-    return 2 * COPIED / in_turns({"copy": lambda: target.copy_(source)}, 5)["copy"].seconds
+    return 2 * COPIED / float(np.median(in_turns({"copy": lambda: target.copy_(source)}, 5)["copy"]))
 
 
 def rows(options: argparse.Namespace) -> Rows:
@@ -185,7 +181,6 @@ def rows(options: argparse.Namespace) -> Rows:
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:
-    """The cases of all devices as a Markdown table."""
     rates = {row["device"]: row["bytes_a_second"] for row in results if row["part"] == "device"}
     text = [
         f"Pairs of frames in batches of stacks, exposure of {EXPOSURE_ROWS} rows; the tracker takes one frame. "

@@ -44,7 +44,6 @@ MIN_OFFSET = 0.05  # px, amplitude of the offsets of a tone from which it must b
 MANY_STD, WRONG_SHARE = 5.0, 0.02  # of a parameter
 WRONG_DISPLACEMENT, WRONG_PX, KNOWN_DISPLACEMENT = 0.05, 0.01, 0.02  # share of its rms, px, share
 MERGED = 0.25  # of 1 / duration; closer tones count as one
-WRONG_IN = ("wrong_parameter", "wrong_displacement")  # keys of the figures of an axis
 WORSE_DB = 0.1
 RIM = 1 / 12  # of the frame; pixels near the border are not compared
 WITHIN_95 = 1.96
@@ -144,57 +143,48 @@ def mean_of_columns(found: rsv.DetectionResult, starts: torch.Tensor, exposure: 
 
 
 def judge_axis(found: rsv.DetectionResult, taken: Recording, axis: int) -> dict[str, Any]:
-    """Outcome of one axis with its figures."""
+    """Outcome and figures of x, y, roll or zoom; turns count as displacements at half the width from the centre."""
     num_frames, height = taken.starts.shape
     stated = taken.timing.row_starts(num_frames, height)
     if taken.timing.readout_direction == "reverse":  # in the order of the image rows
         stated = stated.flip(1)
-    shown = mean_of_columns(found, stated, taken.timing.exposure_time)[..., axis].numpy()
-    true = np.zeros((0, 3)) if taken.case.tones is None else observable_tones(taken, axis)
-    truths = [without_trend(taken.displacement()[axis], taken.starts)]
-    if taken.case.tones is not None:  # tones that are not observable may be found all the same
+    # 1. The displacement, and its difference from the true one.
+    turns, arm = axis > 1, 0.5 * taken.frames.shape[-1] if axis > 1 else 1.0
+    has_tones, true = taken.case.tones is not None and not turns, np.zeros((0, 3))
+    if turns:
+        shown = arm * found.vibration.mean_displacement(stated, taken.timing.exposure_time)[..., axis].numpy()
+        truths = [arm * without_trend(taken.case.motion(taken.starts + 0.5 * taken.exposure)[axis], taken.starts)]
+    else:
+        shown = mean_of_columns(found, stated, taken.timing.exposure_time)[..., axis].numpy()
+        truths = [without_trend(taken.displacement()[axis], taken.starts)]
+    if has_tones:  # tones that are not observable may be found all the same
+        true = observable_tones(taken, axis)
         truths.append(without_trend(taken.displacement_by(true), taken.starts))
     error, size = min((rms(without_trend(shown, stated.numpy()) - truth), rms(truth)) for truth in truths)
-    std = float(
-        displacement_uncertainty(
-            found.vibration, found.std_if_hidden_tone or found.std, taken.timing, num_frames, height
-        )[0][axis]
-    )
-    tones, wrong_number = ([], False) if taken.case.tones is None else tone_errors(found, true, axis)
-    reliable = bool(found.reliable[axis])
+    stds = found.std if turns else found.std_if_hidden_tone or found.std
+    of_rows, _ = displacement_uncertainty(found.vibration, stds, taken.timing, num_frames, height)
+    std = arm * float(of_rows[axis])
+    # 2. The outcome.
+    tones, wrong_number = tone_errors(found, true, axis) if has_tones else ([], False)
     wrong_parameter = any(
         abs(tone[f"{name}_z"]) > MANY_STD and abs(tone[f"{name}_error"]) > WRONG_SHARE
         for tone in tones
         for name in ("amplitude", "frequency")
     )
     wrong_displacement = error > max(WRONG_DISPLACEMENT * size, WRONG_PX) and (wrong_number or error > MANY_STD * std)
-    if not reliable:
-        known = not taken.case.timing_is_wrong and error < KNOWN_DISPLACEMENT * size and not wrong_parameter
+    if not bool(found.reliable[axis]):
+        known = not (turns or taken.case.timing_is_wrong or wrong_parameter) and error < KNOWN_DISPLACEMENT * size
         outcome = "known" if known else "refused"
     elif not (wrong_parameter or wrong_displacement):
         outcome = "correct"
     else:
         outcome = "assumed" if not wrong_displacement and is_assumed(found, taken, axis, tones) else "wrong"
-    wrong = [name for name, is_wrong in zip(WRONG_IN, (wrong_parameter, wrong_displacement), strict=True) if is_wrong]
-    return of_axis(found, axis, outcome, wrong, (error, size, std), tones, len(true))
-
-
-def of_axis(
-    found: rsv.DetectionResult,
-    axis: int,
-    outcome: str,
-    wrong: list[str],
-    sizes: tuple[float, float, float],
-    tones: list[dict[str, float]],
-    true_tones: int,
-) -> dict[str, Any]:
-    """Outcome and figures of an axis; ``sizes`` are error, rms and standard deviation of the displacement in px."""
-    error, size, std = sizes
     return {
         "outcome": outcome,
-        **{name: outcome == "wrong" and name in wrong for name in WRONG_IN},
+        "wrong_parameter": outcome == "wrong" and wrong_parameter,
+        "wrong_displacement": outcome == "wrong" and wrong_displacement,
         "tones": tones,
-        "true_tones": true_tones,
+        "true_tones": int(size > 0) if turns else len(true),
         "found_tones": int((found.vibration.amplitude[axis] > 0).sum()),
         "largest_z": max((abs(t[f"{name}_z"]) for t in tones for name in ("amplitude", "frequency")), default=0.0),
         "displacement_px": size,
@@ -202,21 +192,6 @@ def of_axis(
         "displacement_std": std / max(size, 1e-9),
         "reasons": list(found.reasons[axis]),
     }
-
-
-def judge_turn(found: rsv.DetectionResult, taken: Recording, axis: int) -> dict[str, Any]:
-    """Outcome of roll (axis 2) or zoom (3), as displacements at half the width from the centre; 0 if there is none."""
-    num_frames, height = taken.starts.shape
-    arm = 0.5 * taken.frames.shape[-1]  # px
-    stated = taken.timing.row_starts(num_frames, height)
-    shown = arm * found.vibration.mean_displacement(stated, taken.timing.exposure_time)[..., axis].numpy()
-    truth = arm * without_trend(taken.case.motion(taken.starts + 0.5 * taken.exposure)[axis], taken.starts)
-    error, size = rms(without_trend(shown, stated.numpy()) - truth), rms(truth)
-    std = arm * float(displacement_uncertainty(found.vibration, found.std, taken.timing, num_frames, height)[0][axis])
-    reliable = bool(found.reliable[axis])
-    wrong = reliable and error > max(WRONG_DISPLACEMENT * size, WRONG_PX) and error > MANY_STD * std
-    outcome = "wrong" if wrong else "correct" if reliable else "refused"
-    return of_axis(found, axis, outcome, ["wrong_displacement"], (error, size, std), [], int(size > 0))
 
 
 def best_constant(image: Array, still: Array, rim: int, steps: int = 4) -> Array:
@@ -257,8 +232,7 @@ def judge_case(name: str, number: int, size: int) -> dict[str, Any]:
         found = rsv.detect_vibration(frames, taken.timing)
     except ValueError as error:
         return case | {"error": str(error), "axes": []}
-    case["axes"] = [judge_axis(found, taken, axis) for axis in range(2)]
-    case["axes"] += [judge_turn(found, taken, axis) for axis in range(2, found.vibration.num_axes)]
+    case["axes"] = [judge_axis(found, taken, axis) for axis in range(found.vibration.num_axes)]
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", rsv.RestorationWarning)
         restored = rsv.restore(frames, taken.timing, found)
@@ -271,7 +245,6 @@ def judge_case(name: str, number: int, size: int) -> dict[str, Any]:
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    """All cases of the classes."""
     with one_thread():
         return [
             judge_case(name, number, options.honesty_size)

@@ -3,7 +3,7 @@
 A scene is given on a grid ``FINER`` times finer than the pixels. Gaussian optics and the square pixel are applied on
 this grid, and the pixels are sampled from it by cubic splines at the scene position that each of them sees, so that
 detail above the Nyquist frequency aliases as on a sensor. The motion is any function of time: translation, roll and
-zoom. It shares no code with the package or with independent_camera.py.
+zoom. It shares no code with the package.
 
 A pixel position p sees the scene position s with p - c = (1 + zoom) R(roll) (s - c) + (x, y), c being the centre of the
 frame. Positions are in px, the origin is the centre of the first pixel of the frame.
@@ -13,10 +13,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from benchmarks.independent_camera import Array, exposed
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter, uniform_filter
 
-Array = NDArray[np.float64]
 Motion = Callable[[Array], Array]  # times (...) in s -> (4, ...): x and y in px, roll in rad, zoom
 
 FINER = 4  # points of the scene per px and axis
@@ -75,12 +75,6 @@ def seen_positions(
     return middle[0] + cos * down - sin * right, middle[1] + cos * right + sin * down
 
 
-def exposure_nodes(count: int, exposure: float) -> tuple[Array, Array]:
-    """Times of Gauss-Legendre quadrature within an exposure, and weights with sum 1."""
-    nodes, weights = np.polynomial.legendre.leggauss(count)
-    return 0.5 * exposure * (nodes + 1.0), 0.5 * weights
-
-
 def longest_path(motion: Motion, starts: Array, exposure: float, size: tuple[int, int], fastest: float = 0.0) -> float:
     """Length in px of the longest path of a point of the frame within an exposure."""
     x, y, roll, zoom = motion(starts.ravel()[:, None] + np.linspace(0.0, exposure, 65))
@@ -96,27 +90,29 @@ def take_frames(layers: Sequence[Layer], motion: Motion, starts: Array, exposure
     path = longest_path(motion, starts, exposure, size, fastest)
     count = int(min(most, least + np.ceil(for_a_px * path))) if path > 0 else 1
     row, column = np.arange(float(size[0]))[:, None], np.arange(float(width))[None, :]
-    frames = np.zeros((len(starts), *size))
-    for number, of_rows in enumerate(starts):
-        for moment, weight in zip(*exposure_nodes(count, exposure), strict=True):
-            times = (of_rows + moment)[:, None]
-            down, right = seen_positions(motion, times, row, column, size)
-            light = np.zeros(size)
-            for part in layers:
-                at = (down - part.velocity[1] * times, right - part.velocity[0] * times)
-                if part.cover is not None:
-                    light *= 1.0 - _sampled(part.cover, *at)
-                light += _sampled(part.light, *at)
-            frames[number] += weight * light
-    return frames
+
+    def seen_at(times: Array) -> Array:
+        down, right = seen_positions(motion, times, row, column, size)
+        light = np.zeros(size)
+        for part in layers:
+            at = (down - part.velocity[1] * times, right - part.velocity[0] * times)
+            if part.cover is not None:
+                light *= 1.0 - _sampled(part.cover, *at)
+            light += _sampled(part.light, *at)
+        return light
+
+    return np.stack([exposed(seen_at, of_rows[:, None], exposure, count) for of_rows in starts])
 
 
 def row_displacement(motion: Motion, starts: Array, exposure: float, width: int) -> Array:
     """Displacement (2, T, H) in px, axes (x, y): the mean over the columns of a row and its exposure."""
-    moments, weights = exposure_nodes(NODES[2], exposure)
-    row, column = np.arange(float(starts.shape[1]))[None, :, None], np.array(0.5 * (width - 1))
-    down, right = seen_positions(motion, starts[..., None] + moments, row, column, (starts.shape[1], width))
-    return np.stack([(column - right) @ weights, (row - down) @ weights])
+    row, column = np.arange(float(starts.shape[1])), np.array(0.5 * (width - 1))
+
+    def moved_at(times: Array) -> Array:
+        down, right = seen_positions(motion, times, row, column, (starts.shape[1], width))
+        return np.stack([column - right, row - down])
+
+    return exposed(moved_at, starts, exposure, NODES[2])
 
 
 def standing(x: float = 0.0, y: float = 0.0) -> Motion:

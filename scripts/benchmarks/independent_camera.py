@@ -1,43 +1,31 @@
-"""Simulated frames of a vibrating rolling-shutter camera, independent of the package: NumPy, float64.
+"""Simulated frames of vibrating rolling-shutter cameras, independent of the package: NumPy and SciPy, float64.
 
-The scene is a periodic, band-limited function. It is interpolated densely by Fourier transforms along both axes: a
-phase ramp along rows, and across rows zero padding to eight times as many, between which a polynomial of eight points
-is exact to 1e-6. The mean over an exposure is computed by Gauss-Legendre quadrature; equidistant times would require
-hundreds of samples for long exposures.
+The scene is a band-limited function. It is interpolated along rows by a phase ramp on its Fourier transform, and across
+rows by a quintic spline between rows that a cosine transform makes four times as many: for drawn cities the rms error
+is 2e-5. The mean over an exposure is computed by Gauss-Legendre quadrature; equidistant times would require hundreds of
+samples for long exposures.
 
 For cameras that alias, the scene has several points per px: optics (a Gaussian) and pixels (squares) are factors on its
 spectrum, and the frames sample the result at the pixels.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft, ndimage, sparse
+from scipy.interpolate import BSpline
 
 Array = NDArray[np.float64]
 
-BETWEEN = 8  # interpolated rows per row of the scene
 POINTS_PER_PX = 4  # of the scenes of cameras that alias
-ALIASING = {"points": POINTS_PER_PX, "between": 4}  # options of take_frames for them
-POINTS = 8  # of the polynomial between interpolated rows
-MOMENTS = (8, 4.0)  # nodes of an exposure: minimum, and per px of the longest possible path
-
-
-class Timing(Protocol):
-    """Times of a camera in s: of a row, 0 for a global shutter; of an exposure; from frame to frame."""
-
-    @property
-    def row_time(self) -> float: ...  # noqa: D102
-    @property
-    def exposure_time(self) -> float: ...  # noqa: D102
-    @property
-    def frame_period(self) -> float: ...  # noqa: D102
 
 
 @dataclass(frozen=True)
 class Shake:
-    """The motion: tones of each axis (x, y), arrays (2, K), and an image motion in px/s, (2,)."""
+    """Tones of each axis (x, y), arrays (2, K), and an image motion in px/s, (2,)."""
 
     amplitude: Array
     frequency: Array
@@ -51,19 +39,14 @@ class Shake:
         return cls(*(values.numpy() for values in parts))
 
     def displacement(self, times: Array) -> Array:
-        """Displacement (2, ...) in px."""
-        flat = times.reshape(1, 1, -1)
-        tones = self.amplitude[..., None] * np.sin(2 * np.pi * self.frequency[..., None] * flat + self.phase[..., None])
-        return (tones.sum(1) + self.image_motion[:, None] * flat[0]).reshape(2, *times.shape)
+        """Displacement (..., 2) in px."""
+        times = times[..., None]
+        tones = self.amplitude * np.sin(2 * np.pi * self.frequency * times[..., None] + self.phase)
+        return tones.sum(-1) + self.image_motion * times
 
     def reach(self, duration: float) -> Array:
         """Largest displacement (2,) in px within a duration from the time origin."""
         return self.amplitude.sum(1) + np.abs(self.image_motion) * duration
-
-    def longest_path(self, duration: float) -> float:
-        """Upper bound of the path in px within a duration, from the largest speed or from the range of every period."""
-        cycles = np.minimum(np.pi * self.frequency * duration, 2.0 + 4.0 * self.frequency * duration)
-        return float((2 * self.amplitude * cycles).sum(1).max() + np.abs(self.image_motion).max() * duration)
 
 
 def closed(scene: Array, rim: int) -> Array:
@@ -76,72 +59,58 @@ def closed(scene: Array, rim: int) -> Array:
     return faded + scene.mean()
 
 
-def fine_rows(scene: Array, finer: int = BETWEEN) -> NDArray[np.complex128]:
-    """Spectra along rows (``finer`` times H, U) of the scene, interpolated across rows."""
-    along = np.fft.rfft(scene, axis=1)
-    spectrum = np.fft.fftshift(np.fft.fft(along, axis=0), axes=0)
-    height = len(scene)
-    padded = np.zeros((finer * height, along.shape[1]), dtype=complex)
-    first = (finer * height) // 2 - height // 2
-    padded[first : first + height] = spectrum
-    return np.fft.ifft(np.fft.ifftshift(padded, axes=0), axis=0) * finer
-
-
-def polynomial_weights(fraction: Array) -> Array:
-    """Lagrange weights (..., ``POINTS``) of the points around a position ``fraction`` behind the middle one."""
-    points = np.arange(POINTS) - (POINTS // 2 - 1)
-    weights = np.ones((*fraction.shape, POINTS))
-    for i, own in enumerate(points):
-        for other in np.delete(points, i):
-            weights[..., i] *= (fraction - other) / (own - other)
-    return weights
-
-
-def exposure_moments(shake: Shake, duration: float) -> tuple[Array, Array]:
-    """Quadrature nodes of an exposure, as fractions of it, and their weights."""
-    least, for_a_px = MOMENTS
-    nodes, weights = np.polynomial.legendre.leggauss(least + int(np.ceil(for_a_px * shake.longest_path(duration))))
-    return 0.5 * (nodes + 1), 0.5 * weights
+def exposed(seen_at: Callable[[Array], Array], starts: Array, exposure: float, nodes: int) -> Array:
+    """Mean over an exposure of what is seen at times, by Gauss-Legendre quadrature; ``starts`` in s."""
+    moments, weights = np.polynomial.legendre.leggauss(nodes)
+    parts = (0.5 * w * seen_at(starts + 0.5 * (1 + m) * exposure) for m, w in zip(moments, weights, strict=True))
+    return np.asarray(sum(parts))
 
 
 def take_frames(
     scene: Array,
-    shake: Shake,
-    timing: Timing,
+    motion: Any,
+    timing: Any,
     num_frames: int,
     size: tuple[int, int],
     *,
     points: int = 1,
-    between: int = BETWEEN,
-    nodes: int | None = None,
-    rows: NDArray[np.complex128] | None = None,
+    between: int = 4,
 ) -> Array:
-    """Frames (T, H, W) without noise, centred on a periodic scene of ``points`` per px along both axes.
+    """Frames (T, H, W) without noise, centred on a scene of ``points`` per px along both axes.
 
-    There are ``between`` interpolated rows per row of the scene; ``rows`` are ``fine_rows(scene, between)``, where they
-    are used several times. The quadrature of an exposure has as many ``nodes`` as the motion needs, if none are given.
+    ``motion.displacement(times)`` is (N, 2) in px, axes (x, y), at times (N,) in s. ``timing`` has ``row_time`` (0 for
+    a global shutter), ``exposure_time`` and ``frame_period`` in s.
+    The spline has ``between`` rows per row of the scene; 1 suffices for scenes that are blurred by 0.8 px or more.
     """
-    rows = fine_rows(scene, between) if rows is None else rows
     top, left = ((whole - points * part) // 2 for whole, part in zip(scene.shape, size, strict=True))
-    u = np.fft.rfftfreq(scene.shape[1]) * points  # cycles per px
+    # 1. Interpolated rows, as coefficients of a quintic spline across rows and Fourier transforms along them.
+    rows = fft.idct(fft.dct(scene, axis=0), n=between * len(scene), axis=0) * between if between > 1 else scene
+    spectra = np.fft.rfft(ndimage.spline_filter1d(rows, 5, axis=0, mode="reflect"), axis=1)
+    fine, coarse = (np.arange(*steps) * points / scene.shape[1] for steps in ((16,), (0, spectra.shape[1], 16)))
+    basis = BSpline.basis_element(np.arange(7) - 3.0, extrapolate=False)
+
+    def seen_at(times: Array) -> Array:
+        x, y = motion.displacement(times).T
+        # across the rows: six taps of the spline
+        place = between * (top + points * (np.arange(size[0]) - y) + 0.5)[:, None] - 0.5
+        taps = np.floor(place).astype(int) - 2 + np.arange(6)
+        weights = np.nan_to_num(basis(place - taps)).ravel()
+        taps = np.clip(taps, 0, len(rows) - 1).ravel()
+        moved = sparse.csr_array((weights, taps, 6 * np.arange(size[0] + 1)), (size[0], len(rows)))
+        # along the rows: phase factors of all frequencies as products of those of two short lists
+        turn = -2j * np.pi * x[:, None]
+        factors = np.exp(turn * coarse)[..., None] * np.exp(turn * fine)[:, None]
+        return (moved @ spectra) * factors.reshape(size[0], -1)[:, : spectra.shape[1]]
+
+    # 2. Frames; the longest path of a row within an exposure determines the nodes of the quadrature.
     frames = np.zeros((num_frames, *size))
-    if nodes is None:
-        moments, shares = exposure_moments(shake, timing.exposure_time)
-    else:
-        moments, shares = (0.5 * values for values in np.polynomial.legendre.leggauss(nodes))
-        moments = moments + 0.5
     for p in range(num_frames):
-        total = np.zeros((size[0], len(u)), dtype=complex)
-        for moment, share in zip(moments, shares, strict=True):
-            times = p * timing.frame_period + np.arange(size[0]) * timing.row_time + moment * timing.exposure_time
-            x, y = shake.displacement(times)
-            source = (top + points * (np.arange(size[0]) - y)) * between
-            cell = np.floor(source).astype(int)
-            weights = polynomial_weights(source - cell)
-            row = np.zeros_like(total)
-            for i in range(POINTS):
-                row += weights[:, i, None] * rows[(cell + i - (POINTS // 2 - 1)) % len(rows)]
-            total += share * row * np.exp(-2j * np.pi * x[:, None] * u)
+        starts = p * timing.frame_period + np.arange(size[0]) * timing.row_time
+        path = motion.displacement((starts + np.linspace(0, timing.exposure_time, 17)[:, None]).ravel())
+        length = np.abs(np.diff(path.reshape(17, -1, 2), axis=0)).sum((0, 2)).max()
+        # detail of half a cycle per px turns by pi per px of the path; cameras that alias see up to a cycle per px
+        nodes = 6 + int((2 if points == 1 else 4) * length)
+        total = exposed(seen_at, starts, timing.exposure_time, nodes)
         frames[p] = np.fft.irfft(total, n=scene.shape[1], axis=1)[:, left : left + points * size[1] : points]
     return frames
 

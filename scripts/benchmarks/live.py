@@ -44,25 +44,20 @@ class Changing:
     doublings: float = 0.0
 
     def amplitude(self, times: NDArray[Any]) -> NDArray[Any]:
-        """(2, ...) px."""
+        """(..., 2) px."""
         later = np.maximum(times - BEFORE, 0.0)
-        return np.stack([AMPLITUDE[0] * 2.0 ** (self.doublings * later), AMPLITUDE[1] + 0 * times])
+        return np.stack([AMPLITUDE[0] * 2.0 ** (self.doublings * later), AMPLITUDE[1] + 0 * times], -1)
 
     def frequency(self, times: NDArray[Any]) -> NDArray[Any]:
-        """(2, ...) Hz."""
+        """(..., 2) Hz."""
         later = np.maximum(times - BEFORE, 0.0)
-        return np.stack([FREQUENCY[0] + self.sweep * later, FREQUENCY[1] + 0 * times])
+        return np.stack([FREQUENCY[0] + self.sweep * later, FREQUENCY[1] + 0 * times], -1)
 
     def displacement(self, times: NDArray[Any]) -> NDArray[Any]:
-        """(2, ...) px."""
+        """(..., 2) px."""
         later = np.maximum(times - BEFORE, 0.0)
-        cycles = np.stack([FREQUENCY[0] * times + 0.5 * self.sweep * later**2, FREQUENCY[1] * times])
-        phase = PHASE.reshape(2, *(1,) * times.ndim)
-        return np.asarray(self.amplitude(times) * np.sin(2 * np.pi * cycles + phase))
-
-    def longest_path(self, duration: float) -> float:
-        """Upper bound of the path in px within a duration."""
-        return float(4 * np.pi * (AMPLITUDE * FREQUENCY).max() * duration)
+        cycles = np.stack([FREQUENCY[0] * times + 0.5 * self.sweep * later**2, FREQUENCY[1] * times], -1)
+        return np.asarray(self.amplitude(times) * np.sin(2 * np.pi * cycles + PHASE))
 
 
 def timing_of(size: int, exposure_rows: int = EXPOSURE_ROWS) -> rsv.SensorTiming:
@@ -74,7 +69,7 @@ def timing_of(size: int, exposure_rows: int = EXPOSURE_ROWS) -> rsv.SensorTiming
 def frames_of(size: int, motion: Changing, count: int) -> NDArray[np.uint8]:
     """Frames (T, size, size) with noise."""
     scene = closed(city_and_fields(size + 2 * MARGIN, size + 2 * MARGIN, seed=SEED).double().numpy(), MARGIN // 2)
-    taken = take_frames(scene, motion, timing_of(size), count, (size, size), between=4)  # type: ignore[arg-type]
+    taken = take_frames(scene, motion, timing_of(size), count, (size, size))
     noisy = taken + NOISE * np.random.default_rng(SEED).standard_normal(taken.shape)
     return np.clip(np.round(255 * noisy), 0, 255).astype(np.uint8)
 
@@ -209,20 +204,14 @@ def phase_correlated(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.stack(results)
 
 
-def tracked_frames(pixels: NDArray[np.uint8], size: int, method: str) -> Callable[[], NDArray[np.uint8]]:
-    """Function that tracks and restores the frames as fast as possible."""
-
-    def run() -> NDArray[np.uint8]:
-        output = Output(keeps=True)
-        tracker = rsv.VibrationTracker(timing_of(size), method=method)
-        run_live(Repeated(pixels, len(pixels), paced=False), tracker, [output], drops=False)
-        return np.stack(output.frames)
-
-    return run
+def tracked_frames(pixels: NDArray[np.uint8], size: int, method: str) -> NDArray[np.uint8]:
+    """Frames that are tracked and restored as fast as possible."""
+    output, tracker = Output(keeps=True), rsv.VibrationTracker(timing_of(size), method=method)
+    run_live(Repeated(pixels, len(pixels), paced=False), tracker, [output], drops=False)
+    return np.stack(output.frames)
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    """Session, changes, and speed next to peers."""
     size = options.live_size
     pixels = frames_of(size, Changing(), RATE)
     results = [session(pixels, size, options.minutes), accuracy(pixels, size, options.live_periods)]
@@ -232,8 +221,8 @@ def rows(options: argparse.Namespace) -> Rows:
     clip = np.concatenate([pixels, pixels])
     tasks: dict[str, Callable[[], NDArray[np.uint8]]] = {
         "as taken": lambda: clip,
-        "`VibrationTracker`, dewarp": tracked_frames(clip, size, "dewarp"),
-        "`VibrationTracker`, exact": tracked_frames(clip, size, "exact"),
+        "`VibrationTracker`, dewarp": lambda: tracked_frames(clip, size, "dewarp"),
+        "`VibrationTracker`, exact": lambda: tracked_frames(clip, size, "exact"),
         "`cv2.phaseCorrelate`, `cv2.warpAffine`": lambda: phase_correlated(clip),
     }
     for name, work in tasks.items():
@@ -258,7 +247,6 @@ QUANTITIES = {  # of the session
 
 
 def lines(rows: Rows, options: argparse.Namespace) -> list[str]:
-    """The tables in Markdown."""
     one, errors_of, *others = rows
     cells = [(name, text.format(**one)) for name, text in QUANTITIES.items()]
     for place, (quantity, unit) in enumerate((("amplitude", "px"), ("frequency", "Hz"))):

@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from benchmarks.finer import EXPOSURE_ROWS, FADE, MARGIN, ROW_TIME, SEED, SHAKE, decibel
 from benchmarks.independent_camera import (
-    ALIASING,
     POINTS_PER_PX,
     Array,
     after_optics,
@@ -98,7 +97,7 @@ def raw_frames(name: str, timing: rsv.SensorTiming, count: int, side: int) -> tu
     """The colours of a scene after the optics, and its raw frames (T, side, side) without noise."""
     whole = colour_scene(name, POINTS_PER_PX * (side + 2 * MARGIN))
     scene = [after_optics(closed(part, FADE), SIGMA) for part in whole]
-    taken = [take_frames(part, SHAKE, timing, count, (side, side), **ALIASING) for part in scene]
+    taken = [take_frames(part, SHAKE, timing, count, (side, side), points=POINTS_PER_PX) for part in scene]
     return scene, mosaic_of(np.stack(taken, 1), PATTERN)
 
 
@@ -131,13 +130,11 @@ def cases(name: str, side: int) -> Rows:
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    """PSNR on pixels and on half pixels for all scenes, noise levels and numbers of frames."""
     with one_thread():
         return [row for name in options.mosaic_scenes for row in cases(name, options.mosaic_size)]
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:
-    """A table of the figures."""
     names = list(results[0]["peers"])
     text = [
         f"PSNR in dB of all three colours against the noise-free scene after optics and pixel, without a border of "

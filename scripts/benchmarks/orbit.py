@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from benchmarks.independent_camera import ALIASING, POINTS_PER_PX, Array, Shake, after_optics, closed, take_frames
+from benchmarks.independent_camera import POINTS_PER_PX, Array, Shake, after_optics, closed, take_frames
 from harness import Rows, one_thread, table
 
 import rsvib_torch as rsv
@@ -47,12 +47,12 @@ def case(name: str, size: tuple[int, int]) -> dict[str, Any]:
     shake = Shake(*(np.array(values)[:, None] for values in (amplitude, frequency, phase)), np.zeros(2))
     row_time = FRAME_PERIOD / size[0]
     timing = rsv.SensorTiming(row_time, EXPOSURE / row_time, size[0])
-    frames = take_frames(scene_of(size), shake, timing, count, size, **ALIASING)
+    frames = take_frames(scene_of(size), shake, timing, count, size, points=POINTS_PER_PX)
     frames += NOISE * draw.standard_normal(frames.shape)
     found = rsv.detect_vibration(torch.from_numpy(frames).float(), timing)
     # the displacement of all rows, less its mean, which frames do not determine
     times = timing.row_starts(count, size[0]).flatten() + 0.5 * timing.exposure_time
-    error = found.vibration.displacement(times).numpy() - np.moveaxis(shake.displacement(times.numpy()), 0, -1)
+    error = found.vibration.displacement(times).numpy() - shake.displacement(times.numpy())
     error -= error.mean(0)
     return {
         "case": name,
@@ -66,13 +66,11 @@ def case(name: str, size: tuple[int, int]) -> dict[str, Any]:
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    """The detections of all cases."""
     with one_thread():
         return [case(name, tuple(options.orbit_size)) for name in CASES]
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:
-    """A table of true and found tones."""
     height, width = options.orbit_size
     text = [
         f"Tones along x and y in frames of {height} x {width} px of an independent camera ({1 / FRAME_PERIOD:.1f} "

@@ -11,12 +11,15 @@ import argparse
 import math
 import warnings
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
 from benchmarks import library_chain as libraries
 from benchmarks.independent_camera import Shake, closed, take_frames
-from harness import Rows, Timed, in_turns, named, shown_seconds, table, table_of
+from harness import Rows, in_turns, table, table_of
+from numpy.typing import NDArray
 from torch import Tensor
 
 import rsvib_torch as rsv
@@ -179,16 +182,13 @@ def speed(options: argparse.Namespace) -> Rows:
         found = detect(taken, timing, "direct").vibration
         works: dict[str, Callable[[], Any]] = {
             "round trip": lambda f=taken: torch.fft.irfft2(torch.fft.rfft2(f[0]), s=f.shape[1:]),
-            **{name: lambda n=name, f=taken: detect(f, timing, n) for name in DETECTIONS},
-            **{
-                method: lambda m=method, f=taken, v=found: restored_by(f, timing, v, m)
-                for method in ("exact", "dewarp")
-            },
+            **{name: partial(detect, taken, timing, name) for name in DETECTIONS},
+            **{method: partial(restored_by, taken, timing, found, method) for method in ("exact", "dewarp")},
         }
         if device == "cpu":
             array, rows_ = frames.numpy(), libraries.sampled_rows(size, RIM)
             lib = libraries.detect_by_libraries(array, timing)
-            works["libraries"] = lambda a=array: libraries.detect_by_libraries(a, timing)
+            works["libraries"] = partial(libraries.detect_by_libraries, array, timing)
             works["wiener"] = lambda a=array, r=rows_, v=lib: [
                 libraries.wiener_loop(libraries.slabs_and_kernels(a[i], r, timing, v, i), TIMED_BALANCE)
                 for i in range(2)
@@ -197,23 +197,30 @@ def speed(options: argparse.Namespace) -> Rows:
             chains = {PAPER: ("libraries", "wiener"), FASTEST: ("libraries", "remap"), **chains}
         done = in_turns(works, options.runs)
         if "wiener" in done:
-            done["wiener"] = done["wiener"].scaled(size / len(rows_))
+            done["wiener"] *= size / len(rows_)
         results += [
-            {"chain": named(name, device), **_figures(done[first], done[second], done["round trip"])}
+            {
+                "chain": name if device == "cpu" else f"{name} on {device}",
+                **_figures(done[first], done[second], done["round trip"]),
+            }
             for name, (first, second) in chains.items()
         ]
     return results
 
 
-def _figures(detection: Timed, restoration: Timed, round_trip: Timed) -> dict[str, float]:
-    whole = detection + restoration
+def _figures(detection: NDArray[Any], restoration: NDArray[Any], round_trip: NDArray[Any]) -> dict[str, float]:
+    """Median, shortest and longest time of both steps, and the medians of each."""
+    whole, medians = detection + restoration, [float(np.median(one)) for one in (detection, restoration, round_trip)]
+    seconds = float(np.median(whole))
     return {
-        **whole.figures(),
-        "detection_seconds": detection.seconds,
-        "restoration_seconds": restoration.seconds,
-        "detection_round_trips": detection.seconds / round_trip.seconds,
-        "restoration_round_trips": restoration.seconds / 2 / round_trip.seconds,
-        "frames_a_second": 2 / whole.seconds,
+        "seconds": seconds,
+        "seconds_least": float(whole.min()),
+        "seconds_most": float(whole.max()),
+        "detection_seconds": medians[0],
+        "restoration_seconds": medians[1],
+        "detection_round_trips": medians[0] / medians[2],
+        "restoration_round_trips": medians[1] / 2 / medians[2],
+        "frames_a_second": 2 / seconds,
     }
 
 
@@ -231,7 +238,6 @@ def rows(options: argparse.Namespace) -> Rows:
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:
-    """The figures as Markdown tables."""
     compared, timed = ([row for row in results if row["part"] == part] for part in ("accuracy", "speed"))
     text = [
         f"Detection and restoration of a pair of frames, {options.pipeline_rows} x {options.grid_size} px. Errors of "
@@ -250,7 +256,7 @@ def lines(results: Rows, options: argparse.Namespace) -> list[str]:
     text += table_of(
         timed,
         (f"a pair of {options.size} x {options.size} px", "{chain}"),
-        ("seconds", shown_seconds),
+        ("seconds", "{seconds:.3f} ({seconds_least:.3f} to {seconds_most:.3f})"),
         ("detection", "{detection_seconds:.3f}"),
         ("restoration", "{restoration_seconds:.3f}"),
         ("FFT round trips: detection", "{detection_round_trips:.1f}"),

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from benchmarks import independent_camera
-from benchmarks.independent_camera import Array, Shake, closed, fine_rows
+from benchmarks.independent_camera import Array, Shake, closed
 from benchmarks.pipeline import camera
 from harness import Rows, one_thread, table
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
@@ -100,20 +100,14 @@ BORDER = 32  # px of scene beyond the largest displacement, over which it fades 
 OPTICS = 0.5  # px; sigma of the Gaussian optics, in addition to square pixels
 SEED, BITS = 2023, 12
 RIM, EDGE_RIM = 32, 40  # px at the border that are not evaluated, because they are partly outside the frame
-CAMERA = {  # 5 nodes of an exposure: exact to 1e-6 for half a pixel of motion blur, to 1e-4 for 3 px
-    "points": PITCH,
-    "between": 4,
-    "nodes": 5,
-}
 MTF_FREQUENCY = np.linspace(0.0, 0.5, 51)  # cycles/px; every fifth value is stored
 SHOWN = {"at 0.25 cycles/px": 5, "at 0.4": 8, "at Nyquist": 10}  # places of stored values
 
 
 class Scene(NamedTuple):
-    """A periodic scene (``PITCH`` samples per px), its interpolated spectra, and the frame of a camera at rest."""
+    """A scene (``PITCH`` samples per px), and the frame of a camera at rest."""
 
     samples: Array
-    spectra: Any
     still: Array
 
 
@@ -137,13 +131,12 @@ def draw(target: str, size: Sequence[int], image_motion: float = 0.0) -> Scene:
         drawn = city_and_fields(height, width, SEED, sigma=sigma)
     samples = closed(drawn.double().numpy(), (BORDER - 8) * PITCH)
     still = samples[down : height - down : PITCH, across : width - across : PITCH]
-    return Scene(samples, fine_rows(samples, CAMERA["between"]), still)
+    return Scene(samples, still)
 
 
 def taken(scene: Scene, shake: Shake, timing: Any, count: int = 2) -> Array:
     """Frames without noise."""
-    size = scene.still.shape
-    return independent_camera.take_frames(scene.samples, shake, timing, count, size, rows=scene.spectra, **CAMERA)
+    return independent_camera.take_frames(scene.samples, shake, timing, count, scene.still.shape, points=PITCH)
 
 
 def counts_of(frames: Array, noise: float, seed: int) -> Array:
@@ -277,33 +270,29 @@ def trials(
 ) -> Rows:
     """Detection and restoration of two frames by all methods for all noises; without edges (None) detection only."""
     shake = shake_of(case["seed"], case["speed"] * (-1) ** case["seed"])
-    clean = taken(scene, shake, camera(EXPOSURE_ROWS, len(scene.still)))
-    return [row for noise in noises for row in trial(scene, shake, clean, case | {"noise": noise}, edges)]
-
-
-def trial(
-    scene: Scene, shake: Shake, clean: Array, case: dict[str, Any], edges: Sequence[tuple[str, rsv.SlantedEdge]] | None
-) -> Rows:
-    """Detection and restoration of two frames with one noise."""
-    array = counts_of(clean, case["noise"], case["seed"])
-    frames, timing = torch.from_numpy(array).float(), camera(EXPOSURE_ROWS, len(scene.still))
-    found = {name: rsv.detect_vibration(frames, timing, **options) for name, (options, _) in METHODS.items()}
-    results = [
-        {"part": "detection", **case, "method": name, "axis": axis, **values}
-        for name, result in found.items()
-        for axis, values in detection_values(result, shake).items()
-    ]
-    if edges is None:
-        return results
-    images = {DEGRADED: array}
-    restoring = {name: (found[name].vibration, options) for name, (_, options) in METHODS.items()}
-    for name, (motion, options) in {**restoring, JOINT: (found[DEFAULT].vibration, {"joint": 2})}.items():
-        images[name] = rsv.restore(frames, timing, motion, check=False, **options).double().numpy()
-    return results + [
-        {"part": "restoration", **case, "method": name, **row}
-        for name, restored in images.items()
-        for row in quality(restored, scene.still, edges)
-    ]
+    timing, results = camera(EXPOSURE_ROWS, len(scene.still)), []
+    clean = taken(scene, shake, timing)
+    for noise in noises:
+        array, of_noise = counts_of(clean, noise, case["seed"]), case | {"noise": noise}
+        frames = torch.from_numpy(array).float()
+        found = {name: rsv.detect_vibration(frames, timing, **options) for name, (options, _) in METHODS.items()}
+        results += [
+            {"part": "detection", **of_noise, "method": name, "axis": axis, **values}
+            for name, result in found.items()
+            for axis, values in detection_values(result, shake).items()
+        ]
+        if edges is None:
+            continue
+        images = {DEGRADED: array}
+        restoring = {name: (found[name].vibration, options) for name, (_, options) in METHODS.items()}
+        for name, (motion, options) in {**restoring, JOINT: (found[DEFAULT].vibration, {"joint": 2})}.items():
+            images[name] = rsv.restore(frames, timing, motion, check=False, **options).double().numpy()
+        results += [
+            {"part": "restoration", **of_noise, "method": name, **row}
+            for name, restored in images.items()
+            for row in quality(restored, scene.still, edges)
+        ]
+    return results
 
 
 class GlobalShutter(NamedTuple):
@@ -338,7 +327,6 @@ def global_shutter(frames: int = 24, candidates: int = 4000) -> Rows:
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    """All trials, and the camera at rest."""
     results: Rows = []
     with one_thread():
         for target in TARGETS:
@@ -462,7 +450,6 @@ def condition_cells(results: Rows) -> list[list[str]]:
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:
-    """The comparison with the paper."""
     noise, (height, width) = options.trial_noises[0], options.trial_size
     usual = chosen(results, noise=noise, speed=0.0)
     detection, restoration = (chosen(usual, part=part) for part in ("detection", "restoration"))

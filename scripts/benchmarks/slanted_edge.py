@@ -87,14 +87,12 @@ def other_row(name: str, seeds: int) -> dict[str, Any]:
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    """Errors of the MTF and of MTF50 for all optics."""
     fewer = max(options.seeds // 5, 1)
     with one_thread():
         return [*(gaussian_row(sigma, options.seeds) for sigma in SIGMAS), *(other_row(name, fewer) for name in OPTICS)]
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:
-    """The figures as Markdown tables."""
     of_part = {part: [row for row in results if row["part"] == part] for part in ("gaussian", "other")}
     noisy = ("MTF50 rms, noise 1 %", "{noisy_percent:.2f} %")
     return [

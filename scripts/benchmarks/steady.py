@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 from harness import Rows, table, write_h264
 from numpy.typing import NDArray
+from scipy.integrate import cumulative_trapezoid
 
 import rsvib_torch as rsv
 from rsvib_torch.datasets import city_and_fields
@@ -82,8 +83,7 @@ def angles_of(rates: str, count: int) -> tuple[Array, Array]:
     if rates:
         table_of = np.loadtxt(rates, delimiter=",", skiprows=1)
         times, turning = table_of[:, 0] - table_of[0, 0], table_of[:, 1:4] - table_of[:, 1:4].mean(0)
-        steps = 0.5 * (turning[1:] + turning[:-1]) * np.diff(times)[:, None]
-        return times, np.concatenate([np.zeros((1, 3)), np.cumsum(steps, 0)])
+        return times, cumulative_trapezoid(turning, times, axis=0, initial=0.0)
     rng, times = np.random.default_rng(11), np.arange(0.0, count / RATE + 1.0, 0.002)
     frequencies = np.geomspace(0.3, 18.0, 24)  # Hz; a hand trembles less at higher frequencies
     waves = 2 * np.pi * frequencies * times[:, None, None] + rng.uniform(0, 2 * np.pi, (3, 24))
@@ -182,7 +182,6 @@ def with_vidstab(source: Path, target: Path) -> dict[str, Any] | None:
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    """The figures of each clip: as taken, by vidstab and by the package."""
     scene, hand = scene_of(options.steady_photo), angles_of(options.steady_rates, options.steady_frames)
     timing = rsv.SensorTiming(ROW_TIME, EXPOSURE / ROW_TIME, 1 / RATE / ROW_TIME)
     results = []
@@ -201,7 +200,6 @@ def rows(options: argparse.Namespace) -> Rows:
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:
-    """The table in Markdown."""
     scene = "a photograph" if options.steady_photo else "a drawn scene"
     hand = "the rates of a gyroscope in a hand" if options.steady_rates else "a drawn path of a hand"
     text = (

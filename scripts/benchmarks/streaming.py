@@ -152,7 +152,6 @@ def rows(options: argparse.Namespace) -> Rows:
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:
-    """The figures as a Markdown table."""
     columns = {
         "s per frame": "seconds_a_frame",
         "CPU s per frame of this process": "cpu_seconds_a_frame",

@@ -88,7 +88,6 @@ def cases(draw: int) -> Rows:
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    """All cases of the random recordings."""
     with one_thread():
         return [row for draw in range(options.verdict_draws) for row in cases(options.verdict_seed + draw)]
 

@@ -40,7 +40,7 @@ def planes_of(rows: int, count: int) -> tuple[list[NDArray[np.uint8]], list[Arra
         later = 2 * np.pi * FREQUENCY * 0.5 * (step - 1) * timing.row_time
         shake = Shake(AMPLITUDE[:, None] / step, FREQUENCY[:, None], (PHASE + later)[:, None], np.zeros(2))
         chroma = rsv.SensorTiming(step * timing.row_time, EXPOSURE_ROWS / step, timing.frame_rows / step)
-        taken = take_frames(closed(scene, MARGIN // 2), shake, chroma, min(count, RATE), size, between=4)
+        taken = take_frames(closed(scene, MARGIN // 2), shake, chroma, min(count, RATE), size)
         noisy = taken + NOISE / step * np.random.default_rng(SEED + number).standard_normal(taken.shape)
         low, high = (16, 235) if step == 1 else (16, 240)
         counts.append(np.clip(np.round(low + (high - low) * noisy), 0, 255).astype(np.uint8))
@@ -62,7 +62,6 @@ def psnr_of(path: Path, still: list[Array], rim: int = 24) -> list[float]:
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    """Figures of each method, and of the video as taken."""
     count = options.video_frames
     planes, still = planes_of(options.video_rows, count)
     with tempfile.TemporaryDirectory() as folder:
@@ -86,7 +85,6 @@ def rows(options: argparse.Namespace) -> Rows:
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:
-    """The table in Markdown."""
     height, count = options.video_rows, options.video_frames
     text = [
         f"{count} frames of {16 * height // 9} x {height} px in colour, H.264 (crf {CRF}), by `process_video` (`rsvib "

@@ -6,21 +6,10 @@ import warnings
 import numpy as np
 import pytest
 import torch
+from benchmarks.independent_camera import Shake, after_optics, closed, still_image
 from exact_steps import model_of, solved
 from field_truth import FieldMotion, take_field_frames
-from finer_truth import (
-    FINER,
-    SHAKE,
-    TIMING,
-    VIBRATION,
-    Shake,
-    after_optics,
-    check_gradient,
-    closed,
-    noisy,
-    still_image,
-    taken,
-)
+from finer_truth import FINER, SHAKE, TIMING, VIBRATION, check_gradient, noisy, taken
 from refusals import refuses
 from truth import decibel, draw_scene
 

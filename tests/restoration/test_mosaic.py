@@ -6,19 +6,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from finer_truth import (
-    FINER,
-    SHAKE,
-    TIMING,
-    VIBRATION,
-    after_optics,
-    check_gradient,
-    closed,
-    mosaic_of,
-    noisy,
-    still_image,
-    taken,
-)
+from benchmarks.independent_camera import after_optics, closed, mosaic_of, still_image
+from finer_truth import FINER, SHAKE, TIMING, VIBRATION, check_gradient, noisy, taken
 from refusals import refuses
 from truth import decibel, draw_scene
 

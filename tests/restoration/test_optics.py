@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from finer_truth import FINER, TIMING, VIBRATION, after_optics, closed, noisy, still_image, taken
+from benchmarks.independent_camera import after_optics, closed, still_image
+from finer_truth import FINER, TIMING, VIBRATION, noisy, taken
 from refusals import refuses
 from truth import decibel, draw_scene
 
