@@ -100,7 +100,7 @@ def live_session(given: LiveOptions) -> Answer:
     check_new(files, given.overwrite, inputs)
     for path in files:
         check_writable(path)
-    method = given.tracker.get("method", settings.restoration.get("method", "dewarp"))
+    method: str = (settings.restoration | given.tracker).get("method", "dewarp")
     available = set(method_options(method)) - {"joint"}
     restoration = {name: value for name, value in settings.restoration.items() if name in available}
     drops, source = given.file is None or given.realtime, _source(given, settings)
