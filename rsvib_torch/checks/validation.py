@@ -17,8 +17,16 @@ from textwrap import fill
 from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform, get_args, get_origin, get_type_hints
 
 import pydantic
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
-from pydantic_core import ErrorDetails, PydanticCustomError, core_schema
+from pydantic import (
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    ValidationError,
+    ValidationInfo,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+)
+from pydantic_core import ErrorDetails, PydanticCustomError
 
 from rsvib_torch.checks.values import MAX_NUMBER, described, named
 from rsvib_torch.files.reading import Table, read_text
@@ -69,23 +77,13 @@ class MistakesError(ValueError):
 _CONFIG = ConfigDict(extra="forbid", strict=True, arbitrary_types_allowed=True, use_attribute_docstrings=True)
 
 
-class Extensible:
-    """Mark of a choice whose names are keys of a table that users extend.
+def _name_of_table(value: object, check: ValidatorFunctionWrapHandler, info: ValidationInfo) -> object:
+    """Any text outside of files, which may contain only the names of the package."""
+    return value if info.context is None and isinstance(value, str) else check(value)
 
-    Files may contain only the names of the package. In Python, the function that uses the table refuses unknown names.
-    """
 
-    @staticmethod
-    def __get_pydantic_core_schema__(source: object, handler: object) -> core_schema.CoreSchema:
-        """Schema of any text outside of files."""
-        names = get_args(source)
-
-        def check(value: str, info: core_schema.ValidationInfo) -> str:
-            if info.context is not None and value not in names:
-                raise PydanticCustomError("literal_error", "unknown name")
-            return value
-
-        return core_schema.with_info_after_validator_function(check, core_schema.str_schema())
+# Mark of a choice whose names are keys of a table that users extend: the function that uses it refuses unknown names.
+Extensible = WrapValidator(_name_of_table)
 
 
 @dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(Field,))
@@ -104,7 +102,7 @@ def options(group: type[_Group]) -> type[_Group]:
     initialise = made.__init__
     _describe(made)
 
-    def __init__(self: Any, *args: Any, **given: Any) -> None:  # noqa: N807
+    def __init__(self: _Group, *args: object, **given: object) -> None:  # noqa: N807
         by_place = dict(zip(fields_of(made), args, strict=False))
         values = {name: _plain(value) for name, value in (by_place | given).items()}
         try:
@@ -136,7 +134,7 @@ def fields_of(group: type) -> Table:
     return dict(vars(group)["__pydantic_fields__"])
 
 
-def flat_options(group: Any, function: Callable[..., Any]) -> Callable[..., Any]:
+def flat_options(group: Any, function: Callable[..., object]) -> Any:
     """The function with the fields of a group of options as keyword arguments, instead of its argument ``options``.
 
     Its signature and its docstring list them; the line ``options:`` of the docstring is replaced.

@@ -25,7 +25,7 @@ from rsvib_torch.files.atomic import write_json
 from rsvib_torch.files.reading import Table
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.results.higher_packages import imported
-from rsvib_torch.results.reason import texts
+from rsvib_torch.results.reason import Findings, texts
 from rsvib_torch.results.result_files import figure_png, result_of, write_figure
 from rsvib_torch.text import AXES, data_uri, text_table, wrapped
 
@@ -60,7 +60,7 @@ def verdict_table(
     rows: Sequence[Sequence[str]],
     batch_shape: Sequence[int],
     reliable: Tensor,
-    reasons: tuple[Any, ...],
+    reasons: Sequence[Any],
 ) -> list[str]:
     """A table with rows that begin as in ``axis_rows``, and the verdict: lines with reasons, or a column in a batch."""
     head = [*axis_head(batch_shape), *head]
@@ -352,7 +352,7 @@ class Result(Summarised):
 class JudgedResult(Result):
     """A result with a verdict. Its field ``findings`` has the ``Reason`` objects against it, or against each axis."""
 
-    findings: tuple[Any, ...]
+    findings: Findings
 
     @property
     def reasons(self) -> tuple[Any, ...]:
