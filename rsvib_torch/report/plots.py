@@ -4,7 +4,7 @@ import math
 import os
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -99,25 +99,23 @@ def plain_axes(panel: Axes, x: str = "", y: str = "", *, title: str = "", headin
     panel.set_title(heading or title, **(_HEADING if heading else _TITLE))
 
 
-def _panels(width: float, height: float, rows: int = 1, columns: int = 1, **grid: Any) -> tuple[Figure, Panels]:
+def _panels(width: float, height: float, rows: int = 1, columns: int = 1, **grid: object) -> tuple[Figure, Panels]:
     """A figure of a size in inches, and its panels (rows, columns)."""
     figure = _Drawing(figsize=(width, height), layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False, **grid)
 
 
-def _axes_figure(
-    times: Tensor, curves: Sequence[tuple[Sequence[str], Tensor, str | None]], labels: Sequence[str], **style: object
-) -> Figure:
-    """A panel for x and y each with curves over times in s, and labels of x, of y, and before the name of the axis.
+def _offsets_figure(times: Tensor, curves: Sequence[tuple[Sequence[str], Tensor, str | None]]) -> Figure:
+    """A panel for x and y each with offsets over times in s.
 
-    A curve has its label on both panels, values (N, 2), and a colour (None: that of the axis).
+    Offsets have a label on each panel, values (N, 2), and a colour (None: that of the axis).
     """
     figure, (panels,) = _panels(13, 4.2, 1, 2, sharex=True)
     for axis, (panel, (name, colour)) in enumerate(zip(panels, _AXIS_COLOURS.items(), strict=True)):
         for texts, values, other in curves:
-            panel.plot(1e3 * times.cpu(), values[:, axis].cpu(), color=other or colour, label=texts[axis], **style)
+            panel.plot(1e3 * times.cpu(), values[:, axis].cpu(), ".", color=other or colour, label=texts[axis])
         panel.legend(**_LEGEND_ABOVE, ncols=len(curves))
-        plain_axes(panel, *labels[:2], heading=f"{labels[2]} {name}")
+        plain_axes(panel, _OFFSET_TIME, "offset (px)", heading=f"Offset along {name}")
     return figure
 
 
@@ -145,7 +143,7 @@ def _error_bar(std: Tensor) -> float:
     return 2 * float(std) if math.isfinite(float(std)) else 0.0
 
 
-def _symbol(label: str, **style: Any) -> Line2D:
+def _symbol(label: str, **style: object) -> Line2D:
     """An entry of a legend: a point, or a line if its style is given."""
     return Line2D([], [], label=label, **{"marker": "o", "linewidth": 0, **style})
 
@@ -615,12 +613,10 @@ def _restoration_mtf_figure(result: RestorationMtf) -> Figure:
 def _measured_offsets_figure(curve: OffsetCurve) -> Figure:
     """Draw the measured offsets of each axis, with error bars of one standard deviation if they are known."""
     times, offsets = curve.times[curve.good], curve.offsets[curve.good]
-    labels = (_OFFSET_TIME, "offset (px)", "Offset along")
-    figure = _axes_figure(times, [(("measured",) * 2, offsets, None)], labels, marker=".", linestyle="none")
-    for axis, panel in enumerate(figure.axes if curve.std is not None else ()):
-        assert curve.std is not None
-        x, y, std = (values.cpu() for values in (1e3 * times, offsets[:, axis], curve.std[curve.good][:, axis]))
-        panel.errorbar(x, y, std, fmt="none", ecolor=_GRID, zorder=1)
+    figure = _offsets_figure(times, [(("measured",) * 2, offsets, None)])
+    if curve.std is not None:
+        for panel, values, std in zip(figure.axes, offsets.T.cpu(), curve.std[curve.good].T.cpu(), strict=True):
+            panel.errorbar(1e3 * times.cpu(), values, std, fmt="none", ecolor=_GRID, zorder=1)
     return figure
 
 
@@ -686,11 +682,9 @@ def _spectrum_figure(result: detection.DisplacementSpectrum) -> Figure:
 
 def _check_figure(result: gyroscope.MotionCheck) -> Figure:
     """Draw the offsets of row bands of each axis, before and after a motion is subtracted."""
-    before, after = ([measured_text(rms, digits=3) for rms in of_axes] for of_axes in (result.before, result.after))
-    before, after = [f"offsets {rms} px rms" for rms in before], [f"without the motion {rms} px rms" for rms in after]
-    curves = ((before, result.offsets, _GREY), (after, result.residual, None))
-    labels = (_OFFSET_TIME, "offset (px)", "Offset along")
-    return _axes_figure(result.times, curves, labels, marker=".", linestyle="none")
+    before = [f"offsets {measured_text(rms, digits=3)} px rms" for rms in result.before]
+    after = [f"without the motion {measured_text(rms, digits=3)} px rms" for rms in result.after]
+    return _offsets_figure(result.times, ((before, result.offsets, _GREY), (after, result.residual, None)))
 
 
 def _rotation_figure(result: gyroscope.RotationAlignment) -> Figure:
