@@ -18,12 +18,12 @@ from rsvib_torch.options import COMMAND_LINE
 _NOT_RELIABLE = 3  # exit code
 
 
-def argument(default: object = ..., **form: object) -> Any:
+def argument(default: object = ..., **form: Any) -> Any:
     """An argument of a command; ``form`` has arguments of ``typer.Argument``."""
     return Field(default, json_schema_extra={"positional": True, **form})
 
 
-def option(default: object, *names: str, **form: object) -> Any:
+def option(default: object, *names: str, **form: Any) -> Any:
     """An option of a command that is not named as its field, or has arguments ``form`` of ``typer.Option``."""
     return Field(default, json_schema_extra={"names": list(names), **form})
 

@@ -331,7 +331,7 @@ def full_scale_of(path: Path, info: "StackInfo", config: Config, option: float |
 
 def _restoration_options(info: "StackInfo", full_scale: float | None, options: Table, given: Table) -> Table:
     """Options of ``restore``: those of the configuration file, replaced by those ``given`` on the command line."""
-    method = given.get("method", options.get("method", "exact"))
+    method: str = (options | given).get("method", "exact")
     if method != options.get("method", "exact"):  # other options belong to the configured method
         options = {name: value for name, value in options.items() if name in ("saturation", *method_options(method))}
     if "optics" in given:

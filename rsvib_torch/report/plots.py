@@ -4,7 +4,7 @@ import math
 import os
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -99,7 +99,7 @@ def plain_axes(panel: Axes, x: str = "", y: str = "", *, title: str = "", headin
     panel.set_title(heading or title, **(_HEADING if heading else _TITLE))
 
 
-def _panels(width: float, height: float, rows: int = 1, columns: int = 1, **grid: object) -> tuple[Figure, Panels]:
+def _panels(width: float, height: float, rows: int = 1, columns: int = 1, **grid: Any) -> tuple[Figure, Panels]:
     """A figure of a size in inches, and its panels (rows, columns)."""
     figure = _Drawing(figsize=(width, height), layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False, **grid)
@@ -143,7 +143,7 @@ def _error_bar(std: Tensor) -> float:
     return 2 * float(std) if math.isfinite(float(std)) else 0.0
 
 
-def _symbol(label: str, **style: object) -> Line2D:
+def _symbol(label: str, **style: Any) -> Line2D:
     """An entry of a legend: a point, or a line if its style is given."""
     return Line2D([], [], label=label, **{"marker": "o", "linewidth": 0, **style})
 
