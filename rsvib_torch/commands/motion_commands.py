@@ -16,7 +16,7 @@ from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.init import sensor_toml
 from rsvib_torch.commands.stack_commands import load, print_notes
 from rsvib_torch.commands.terminal import Answer, note, warn, working
-from rsvib_torch.files.atomic import check_writable, whole_file
+from rsvib_torch.files.atomic import whole_file
 from rsvib_torch.files.reading import Table
 from rsvib_torch.options import FreeMotionOptions, MotionUnit, ProcessStackOptions, TimeUnit
 from rsvib_torch.text import measured_text
@@ -46,8 +46,7 @@ def motion(given: MotionOptions) -> Answer:
     To restore frames with the CSV file: rsvib known --motion FILE --unit px --offset 0.
     """
     out, frames = given.out, given.stack
-    shared.check_new([out], given.overwrite, given.inputs)
-    check_writable(out)
+    shared.check_file(out, given.overwrite, given.inputs)
     chosen = {name: value for name, value in given.detection.items() if given.model == "free" or name == "search"}
     pixels, timing = load(given)
     result: detection.MotionDetection | detection.SweptTone
@@ -306,8 +305,7 @@ def calibrate(given: CalibrateOptions) -> Answer:
     _check_given(given)
     paths = [given.part_of(path) for path in given.frames]
     if given.out is not None:
-        shared.check_new([given.out], given.overwrite, [file for path in paths for file in io.stack_files(path)])
-        check_writable(given.out)
+        shared.check_file(given.out, given.overwrite, [file for path in paths for file in io.stack_files(path)])
     infos = [io.read_stack_info(path) for path in paths]
     if given.frame_range is None and infos[0].shape[0] > _CALIBRATED_FRAMES:
         note(f"the first {_CALIBRATED_FRAMES} of {infos[0].shape[0]} frames are used; --frames selects others")

@@ -19,7 +19,7 @@ from rsvib_torch.checks.validation import options
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.terminal import note
 from rsvib_torch.config import Config, read_config
-from rsvib_torch.files.atomic import check_outputs
+from rsvib_torch.files.atomic import check_outputs, check_writable
 from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.timing import SensorSection
 from rsvib_torch.options import RestorationOptions, method_options
@@ -315,6 +315,12 @@ def check_new(
     if existing and not overwrite:
         found = f"results exist already in {existing[0].parent}: {', '.join(path.name for path in existing)}"
         raise FileExistsError(f"{found}; choose another name, or replace them with --overwrite")
+
+
+def check_file(path: Path, overwrite: bool, inputs: Iterable[Path | None]) -> None:
+    """``check_new`` for one file, which must be writable."""
+    check_new([path], overwrite, inputs)
+    check_writable(path)
 
 
 def full_scale_of(path: Path, info: "StackInfo", config: Config, option: float | None) -> float | None:

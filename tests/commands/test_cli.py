@@ -2,7 +2,6 @@
 
 import json
 import re
-import warnings
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from program import refused, rsvib
 from truth import MARGIN, Curve, Motion, crop, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, __version__
-from rsvib_torch.io import StackFormat, formats, read_stack, read_stack_info, write_stack
+from rsvib_torch.io import read_stack, read_stack_info, write_stack
 
 AMPLITUDE, FREQUENCY, PHASE = (1.6, 1.1), (71.0, 113.0), (0.6, -1.2)
 CONFIG = f"""
@@ -249,7 +248,6 @@ def bad_inputs(place):
     """Frames and configurations that are refused, in the folder of the others."""
     write_stack(place / "one.npy", read_stack(place / "frames.tif")[:1])
     (place / "cut.tif").write_bytes((place / "frames.tif").read_bytes()[:100_000])
-    (place / "incomplete.toml").write_text(CONFIG.replace("frame_rows = 512", ""))
     (place / "wrong.toml").write_text(CONFIG.replace("search = 8", "search = 1"))
     return place
 
@@ -261,7 +259,6 @@ def bad_inputs(place):
         ("run", "cut.tif", "camera.toml", "cut.tif: not a readable TIFF stack: "),
         ("run", "none.tif", "camera.toml", "none.tif does not exist"),
         ("detect", "frames.tif", "none.toml", "none.toml: No such file or directory"),
-        ("run", "frames.tif", "incomplete.toml", "sensor: frame_rate or frame_rows is missing"),
         ("detect", "frames.tif", "wrong.toml", "detection.search: expected at least 2, got 1"),
     ],
 )
@@ -330,18 +327,3 @@ def test_missing_gpu(place, tmp_path, capsys):
     arguments = (place / "frames.tif", "--config", place / "camera.toml", "--out", tmp_path / "out")
     error = refused(capsys, "detect", *arguments, "--device", "cuda")
     assert error == "rsvib: error: --device cuda: no CUDA device is available; use auto or cpu\n"
-
-
-def test_warnings_are_one_line(place, tmp_path, capsys, monkeypatch):
-    def warn(_):
-        warnings.warn("the displacement within a row time\nis large", UserWarning, stacklevel=1)
-        raise ValueError("stopped here")
-
-    monkeypatch.setitem(formats.FORMATS, ".warn", StackFormat("warning", (".warn",), warn))
-    (tmp_path / "frames.warn").write_bytes(b"")
-    with warnings.catch_warnings():
-        warnings.simplefilter("always")
-        assert rsvib("run", tmp_path / "frames.warn", tmp_path / "out", "--config", place / "camera.toml") == 2
-    assert capsys.readouterr().err == (
-        "rsvib: warning: the displacement within a row time is large\nrsvib: error: stopped here\n"
-    )

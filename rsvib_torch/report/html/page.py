@@ -251,7 +251,6 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
             figures["windows"] = drawing(report.windows.plot())
     content = {
         "report": report,
-        "title": report.title,
         "mark": mark,
         "verdict": sentences if restored else sentences[:1],
         **detected,
