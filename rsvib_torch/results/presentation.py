@@ -317,7 +317,8 @@ class Result(Summarised):
             elif isinstance(value, Result):
                 object.__setattr__(result, name, value.mapped(function))
             elif isinstance(value, dict):
-                object.__setattr__(result, name, {key: function(entry) for key, entry in value.items()})
+                changed = {key: function(one) if isinstance(one, Tensor) else one for key, one in value.items()}
+                object.__setattr__(result, name, changed)
         return result
 
     def to(self, device: torch.device | str) -> Self:
@@ -333,7 +334,7 @@ class Result(Summarised):
                 shape = tuple(self.batch_shape)
                 raise ValueError(f"a batch of shape {shape} has no figure: select one, result[0].plot()")
             raise TypeError(f"{type(self).__name__} has no figure; these have one: {', '.join(drawn)}")
-        figure = draw(self)
+        figure = draw(self.mapped(lambda values: values.detach().cpu()))
         if path is not None:
             write_figure(figure, path)
         return figure
