@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 
 from rsvib_torch import imaging, motion
 from rsvib_torch.checks.validation import Count, checked, options, validate
-from rsvib_torch.files.reading import read_toml
+from rsvib_torch.files.reading import Table, read_toml
 from rsvib_torch.motion.timing import SensorSection, SensorTiming
 from rsvib_torch.options import RestorationOptions, ToneOptions, WindowOptions
 
@@ -27,10 +27,10 @@ class Config:
     source: str  # name of the file, for messages
     timing: SensorTiming  # the sensor
     full_scale: float | None  # count that corresponds to 1.0 in integer frames; None if it is not in the file
-    detection: dict[str, Any]  # options of ``detect_vibration`` that are in the file
-    restoration: dict[str, Any]  # options of ``restore`` that are in the file
+    detection: Table  # options of ``detect_vibration`` that are in the file
+    restoration: Table  # options of ``restore`` that are in the file
     simulation: Any  # ``[simulation]``, of the class ``simulation_section``; None if it is not in the file
-    stack: dict[str, Any]  # options ``window``, ``follow`` and ``bad_frames`` of ``process_stack`` that are in the file
+    stack: Table  # options ``window``, ``follow`` and ``bad_frames`` of ``process_stack`` that are in the file
     # options of the program that describe the camera, for the commands that it suggests
     arguments: tuple[str, ...] = ()
     path: Path | None = None  # the file; None if the camera is described by options only
@@ -140,10 +140,9 @@ def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, Any
             stated = {name: value for name, value in stated.items() if name not in replaced}
             data["sensor"] = {**stated, **sensor}
     content = validate(ConfigFile, data, source)
-    simulation = None
-    if content.simulation is not None:
-        part: type[object] = options(type("_Part", (), {"__annotations__": {"simulation": simulation_section()}}))
-        simulation = vars(validate(part, {"simulation": content.simulation}, source))["simulation"]
+    simulation = content.simulation
+    if simulation is not None:
+        simulation = validate(simulation_section(), simulation, source, "simulation")
     return Config(
         source=source,
         timing=content.sensor.to_timing(),

@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, SkipValidation
+from pydantic.config import JsonDict
 
 from rsvib_torch.checks.validation import (
     Count,
@@ -54,7 +55,7 @@ TimeUnit = Literal["s", "ms", "us", "ns"]
 Columns = Annotated[int, Field(ge=64, le=2**31)]  # px; narrower bands are often registered wrongly
 Frames = Annotated[int, Field(ge=2, le=2**31)]
 Side = Annotated[float, Field(gt=0.0, le=0.4)]  # parts of a frame; more leaves less than a fifth of it
-COMMAND_LINE: Any = {"command_line": True}  # mark of fields that are options of commands as well
+COMMAND_LINE: JsonDict = {"command_line": True}  # mark of fields that are options of commands as well
 MAX_TONES = 4  # tones of one axis; a record of a few frames does not resolve more
 MAX_HARMONICS = 50  # the sensors of the paper sample a tone of 100 Hz up to its 120th harmonic
 

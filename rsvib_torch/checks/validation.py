@@ -14,11 +14,19 @@ from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
 from textwrap import fill
-from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform, get_args, get_origin, get_type_hints
 
 import pydantic
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
-from pydantic_core import ErrorDetails, PydanticCustomError, core_schema
+from pydantic import (
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    ValidationError,
+    ValidationInfo,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+)
+from pydantic_core import ErrorDetails, PydanticCustomError
 
 from rsvib_torch.checks.values import MAX_NUMBER, described, named
 from rsvib_torch.files.reading import Table, read_text
@@ -69,23 +77,13 @@ class MistakesError(ValueError):
 _CONFIG = ConfigDict(extra="forbid", strict=True, arbitrary_types_allowed=True, use_attribute_docstrings=True)
 
 
-class Extensible:
-    """Mark of a choice whose names are keys of a table that users extend.
+def _name_of_table(value: object, check: ValidatorFunctionWrapHandler, info: ValidationInfo) -> object:
+    """Any text outside of files, which may contain only the names of the package."""
+    return value if info.context is None and isinstance(value, str) else check(value)
 
-    Files may contain only the names of the package. In Python, the function that uses the table refuses unknown names.
-    """
 
-    @staticmethod
-    def __get_pydantic_core_schema__(source: object, handler: object) -> core_schema.CoreSchema:
-        """Schema of any text outside of files."""
-        names = get_args(source)
-
-        def check(value: str, info: core_schema.ValidationInfo) -> str:
-            if info.context is not None and value not in names:
-                raise PydanticCustomError("literal_error", "unknown name")
-            return value
-
-        return core_schema.with_info_after_validator_function(check, core_schema.str_schema())
+# Mark of a choice whose names are keys of a table that users extend: the function that uses it refuses unknown names.
+Extensible = WrapValidator(_name_of_table)
 
 
 @dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(Field,))
@@ -104,7 +102,7 @@ def options(group: type[_Group]) -> type[_Group]:
     initialise = made.__init__
     _describe(made)
 
-    def __init__(self: Any, *args: Any, **given: Any) -> None:  # noqa: N807
+    def __init__(self: _Group, *args: object, **given: object) -> None:  # noqa: N807
         by_place = dict(zip(fields_of(made), args, strict=False))
         values = {name: _plain(value) for name, value in (by_place | given).items()}
         try:
@@ -136,7 +134,7 @@ def fields_of(group: type) -> Table:
     return dict(vars(group)["__pydantic_fields__"])
 
 
-def flat_options(group: Any, function: Callable[..., Any]) -> Callable[..., Any]:
+def flat_options(group: Any, function: Callable[..., object]) -> Any:
     """The function with the fields of a group of options as keyword arguments, instead of its argument ``options``.
 
     Its signature and its docstring list them; the line ``options:`` of the docstring is replaced.
@@ -149,24 +147,19 @@ def flat_options(group: Any, function: Callable[..., Any]) -> Callable[..., Any]
         stated = {name: given.pop(name) for name in names & given.keys()}
         return function(*args, **stated, options=group(**given))
 
-    kind = inspect.Parameter.KEYWORD_ONLY
+    kind, annotations = inspect.Parameter.KEYWORD_ONLY, get_type_hints(group)  # as users read them, without bounds
     of_group = [
-        inspect.Parameter(name, kind, default=field.get_default(), annotation=_without_bounds(field.annotation))
+        inspect.Parameter(
+            name,
+            kind,
+            default=inspect.Parameter.empty if field.is_required() else field.get_default(),
+            annotation=annotations[name],
+        )
         for name, field in fields_of(group).items()
     ]
     flat.__signature__ = inspect.Signature([*direct, *of_group])  # type: ignore[attr-defined]
     flat.__doc__ = _with_options(inspect.getdoc(function) or "", group)
     return flat
-
-
-def _without_bounds(annotation: Any) -> Any:
-    """The annotation of an option as users read it."""
-    if get_origin(annotation) is Annotated:
-        return _without_bounds(get_args(annotation)[0])
-    if arguments := get_args(annotation):
-        plain = tuple(map(_without_bounds, arguments))
-        return annotation.copy_with(plain) if hasattr(annotation, "copy_with") else annotation
-    return annotation
 
 
 def _with_options(text: str, group: type) -> str:
@@ -192,12 +185,15 @@ def checked(build: Callable[..., _Result], *args: object, **kwargs: object) -> _
         raise changed from error
 
 
-def validate(model: type[_Result], data: Mapping[str, object], source: str) -> _Result:
-    """Parsed TOML or JSON as a group of options; an error has a line for each mistake in ``source``."""
+def validate(model: type[_Result], data: Mapping[str, object], source: str, path: str = "") -> _Result:
+    """Parsed TOML or JSON as a group of options; an error has a line for each mistake in ``source``.
+
+    ``path`` names the table of the source that ``data`` is.
+    """
     try:
         return TypeAdapter(model).validate_python(data, context={"file": source})
     except ValidationError as error:
-        mistakes = _mistakes(model, data, error)
+        mistakes = _mistakes(model, data, error, path)
         lines = [": ".join(filter(None, (source, one_line(one.path, 200), one.line))) for one in mistakes]
         more = [f"{source}: {len(lines) - _MAX_LINES} more mistakes"] if len(lines) > _MAX_LINES else []
         all_lines = MistakesError([*lines[:_MAX_LINES], *more])
@@ -223,11 +219,11 @@ class _Mistake:
     is_bound: bool = False  # whether the value has the right type and is out of bounds
 
 
-def _mistakes(model: object, data: object, error: ValidationError, name: str = "") -> list[_Mistake]:
+def _mistakes(model: object, data: object, error: ValidationError, path: str = "") -> list[_Mistake]:
     """The mistakes that pydantic found, one for each key: of the members of a union, that of the fitting type."""
     found: dict[str, _Mistake] = {}
     for entry in error.errors(include_url=False):
-        mistake = _mistake(model, data, entry, name)
+        mistake = _mistake(model, data, entry, path)
         if mistake.path not in found or (mistake.is_bound and not found[mistake.path].is_bound):
             found[mistake.path] = mistake
     return list(found.values())

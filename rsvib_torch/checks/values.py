@@ -3,6 +3,7 @@
 import math
 from importlib import import_module
 from numbers import Real
+from types import ModuleType
 from typing import Any, TypeVar
 
 from rsvib_torch.text import quoted
@@ -84,7 +85,7 @@ def check_whole_number(name: str, value: object, *, at_least: int, at_most: int 
     return value
 
 
-def needed_package(name: str, purpose: str, extra: str) -> Any:
+def needed_package(name: str, purpose: str, extra: str) -> ModuleType:
     """Import an optional package that ``purpose`` needs; an error names the extra of this package that installs it."""
     try:
         return import_module(name)

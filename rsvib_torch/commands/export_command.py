@@ -11,9 +11,8 @@ from rsvib_torch import io, restoration
 from rsvib_torch import report as reports
 from rsvib_torch.checks.validation import options
 from rsvib_torch.commands.flat_command import argument, option
-from rsvib_torch.commands.shared_options import check_new, size_of
+from rsvib_torch.commands.shared_options import check_file, size_of
 from rsvib_torch.commands.terminal import Answer, warn
-from rsvib_torch.files.atomic import check_writable
 from rsvib_torch.options import ExportFormat
 from rsvib_torch.text import AXES
 
@@ -56,8 +55,7 @@ def export(given: ExportOptions) -> Answer:
     if chosen is None:
         raise ValueError(f"the format of {out.name} is not known from its name: give --format gcsv or csv")
     frames = [] if given.frames is None else io.stack_files(given.frames)
-    check_new([out], given.overwrite, [given.vibration, *frames])
-    check_writable(out)
+    check_file(out, given.overwrite, [given.vibration, *frames])
     detected = reports.load_detection(given.vibration)
     if chosen == "csv":
         reports.write_offsets(out, detected)

@@ -18,12 +18,12 @@ from rsvib_torch.options import COMMAND_LINE
 _NOT_RELIABLE = 3  # exit code
 
 
-def argument(default: Any = ..., **form: Any) -> Any:
+def argument(default: object = ..., **form: Any) -> Any:
     """An argument of a command; ``form`` has arguments of ``typer.Argument``."""
     return Field(default, json_schema_extra={"positional": True, **form})
 
 
-def option(default: Any, *names: str, **form: Any) -> Any:
+def option(default: object, *names: str, **form: Any) -> Any:
     """An option of a command that is not named as its field, or has arguments ``form`` of ``typer.Option``."""
     return Field(default, json_schema_extra={"names": list(names), **form})
 
@@ -32,12 +32,12 @@ def option(default: Any, *names: str, **form: Any) -> Any:
 class Given:
     """Mark of a field of a command: a dictionary of those options of another group that are given."""
 
-    group: Any  # the group
+    group: type  # the group
     names: tuple[str, ...] = ()  # its options; by default those whose fields are marked by ``COMMAND_LINE``
     default: str = ""  # where the default comes from, before that of the group
     context: str = ""  # what comes before the description of each
     # for options that are stated in another form than the field: arguments of ``option``
-    forms: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    forms: Mapping[str, Table] = field(default_factory=dict)
 
     def parameters(self) -> Iterator[inspect.Parameter]:
         """The options as parameters, in the order of the group."""
@@ -66,7 +66,7 @@ class _OutputOptions:
     """Print the traceback of an error."""
 
 
-def _parameter(name: str, annotation: Any, default: Any, form: Mapping[str, Any]) -> inspect.Parameter:
+def _parameter(name: str, annotation: object, default: object, form: Table) -> inspect.Parameter:
     """A field as typer reads it; the group checks bounds, and has alternatives such as "auto" that options lack."""
     form = dict(form)
     members = [form.pop("kind")] if "kind" in form else members_of(annotation)

@@ -16,10 +16,10 @@ from rsvib_torch import gyroscope, io
 from rsvib_torch.checks.validation import MistakesError, fields_of, options
 from rsvib_torch.commands.answers import run_step
 from rsvib_torch.commands.flat_command import Given, argument, option
-from rsvib_torch.commands.shared_options import SENSOR_FORMS, check_new, rate, seconds, stated_exposure
+from rsvib_torch.commands.shared_options import SENSOR_FORMS, check_file, rate, seconds, stated_exposure
 from rsvib_torch.commands.terminal import Answer, note, warn, working
 from rsvib_torch.config import presets, read_config
-from rsvib_torch.files.atomic import check_writable, whole_file
+from rsvib_torch.files.atomic import whole_file
 from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.cameras import camera_mode, find_cameras
 from rsvib_torch.motion.timing import SensorSection, SensorTiming
@@ -70,8 +70,7 @@ def init(given: InitOptions) -> Answer:
         raise ValueError("--camera and --row-time both state the row time; give one of them")
     if preset is None and frames is None:
         raise ValueError("give a stack of frames, or --preset NAME (--list-presets lists them)")
-    check_new([out], given.overwrite, [] if frames is None else io.stack_files(frames))
-    check_writable(out)
+    check_file(out, given.overwrite, [] if frames is None else io.stack_files(frames))
     if preset is not None and preset not in presets():
         raise ValueError(f"--preset must be one of {', '.join(presets())}; got {preset!r}")
     text = presets()[preset] if preset is not None else _describe_camera(Path(frames or ""), sensor, camera)

@@ -17,9 +17,8 @@ from rsvib_torch import io, tracking, video
 from rsvib_torch.checks.validation import Count, NotNegative, options
 from rsvib_torch.commands.answers import detection_data
 from rsvib_torch.commands.flat_command import Given, argument, option
-from rsvib_torch.commands.shared_options import CameraOptions, RangeOptions, check_new, size_of
+from rsvib_torch.commands.shared_options import CameraOptions, RangeOptions, check_file, size_of
 from rsvib_torch.commands.terminal import Answer, error_line, warn
-from rsvib_torch.files.atomic import check_writable
 from rsvib_torch.files.reading import Table
 from rsvib_torch.options import BorderName, PixelFormat, TrackerOptions, method_options
 from rsvib_torch.text import number_of
@@ -96,10 +95,9 @@ def live_session(given: LiveOptions) -> Answer:
     _check_options(given)
     files = [] if given.written is None else [given.written]
     inputs = [*([] if given.file is None else io.stack_files(given.file)), settings.path]
-    check_new(files, given.overwrite, inputs)
     for path in files:
-        check_writable(path)
-    method = given.tracker.get("method", settings.restoration.get("method", "dewarp"))
+        check_file(path, given.overwrite, inputs)
+    method: str = (settings.restoration | given.tracker).get("method", "dewarp")
     available = set(method_options(method)) - {"joint"}
     restoration = {name: value for name, value in settings.restoration.items() if name in available}
     drops, source = given.file is None or given.realtime, _source(given, settings)

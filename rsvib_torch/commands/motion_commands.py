@@ -16,7 +16,7 @@ from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.init import sensor_toml
 from rsvib_torch.commands.stack_commands import load, print_notes
 from rsvib_torch.commands.terminal import Answer, note, warn, working
-from rsvib_torch.files.atomic import check_writable, whole_file
+from rsvib_torch.files.atomic import whole_file
 from rsvib_torch.files.reading import Table
 from rsvib_torch.options import FreeMotionOptions, MotionUnit, ProcessStackOptions, TimeUnit
 from rsvib_torch.text import measured_text
@@ -46,8 +46,7 @@ def motion(given: MotionOptions) -> Answer:
     To restore frames with the CSV file: rsvib known --motion FILE --unit px --offset 0.
     """
     out, frames = given.out, given.stack
-    shared.check_new([out], given.overwrite, given.inputs)
-    check_writable(out)
+    shared.check_file(out, given.overwrite, given.inputs)
     chosen = {name: value for name, value in given.detection.items() if given.model == "free" or name == "search"}
     pixels, timing = load(given)
     result: detection.MotionDetection | detection.SweptTone
@@ -62,26 +61,26 @@ def motion(given: MotionOptions) -> Answer:
     restore = ("known", frames, frames.with_name("restored.tif"), *given.settings.arguments, *known_motion)
     return Answer(
         {f"Motion in {frames.name}": [result.summary()]},
-        {"motion": _without_curve(result), "columns": list(columns)},
+        {"motion": _without_curves(result), "columns": list(columns)},
         [out],
         [answers.next_step("restore the frames", *restore)] * bool(result.reliable.any()),
         answers.verdicts([result]),
     )
 
 
-def _without_curve(result: Result) -> Table:
+_CURVES = {"motion", "times", "displacement", "offsets", "residual", "light", "fitted_light", "measured", "predicted"}
+
+
+def _without_curves(result: Result) -> Table:
     """The values of a result without its curves, which have a value for every row or knot."""
-    curve = {"motion", "times", "displacement", "offsets", "residual", "light", "fitted_light"}
-    curve |= {"measured", "predicted"}
-    curve |= {"std"} if isinstance(result, detection.MotionDetection) else set()
-    return {name: value for name, value in result.to_dict().items() if name not in curve}
+    curves = _CURVES | ({"std"} if isinstance(result, detection.MotionDetection) else set())
+    return {name: value for name, value in result.to_dict().items() if name not in curves}
 
 
 @options
-class KnownOptions(shared.StackCommand):
+class KnownOptions(shared.RestoredStack):
     """Options of ``known``."""
 
-    restored: Path = shared.restored_argument()
     motion: Path = option(...)
     """CSV file with the columns time, x and y; or, without --unit, the angular rates of a gyroscope: a gyroflow log
     (.gcsv), a GoPro video (.mp4), or CSV with three rates whose names state the unit."""
@@ -136,15 +135,13 @@ def known(given: KnownOptions) -> Answer:
     frames, and refused if it does not explain them. If the restored frames are judged no better than the input, the
     input is written unchanged, unless --force is given.
     """
-    manifest = given.restored.with_name(f"{given.restored.name}.manifest.json")
-    outputs, replaces = [*io.stack_files(given.restored), manifest], given.overwrite or "resume" in given.processing
+    outputs = [*io.stack_files(given.restored), given.manifest]
+    replaces = given.overwrite or "resume" in given.processing
     shared.check_new(outputs, replaces, [*given.inputs, given.motion, given.lens_profile])
     recorded = _recorded(given)
-    info, scale, options = given.planned_restoration()
+    info, scale, options = given.planned_stack({})
     info, timing = replace(info, full_scale=scale), given.settings.timing
     ignore = stacks.mask_of_regions(given.ignore or (), (info.shape[-2], info.shape[-1]))
-    shape = shared.restored_shape(info, options)
-    io.check_stack_target(given.restored, shape, dtype=info.dtype, full_scale=scale, like=info)
     print_notes(info, given.settings)
     # 1. The motion on the clock of the frames.
     results: dict[str, list[str]] = {}
@@ -168,7 +165,7 @@ def known(given: KnownOptions) -> Answer:
                 fit_row_time=given.fit_row_time,
             )
         results["Recording on the clock of the frames"] = [found.summary()]
-        data["alignment"] = _without_curve(found)
+        data["alignment"] = _without_curves(found)
         _refuse(given, found.reasons)
         placed = found.motion
         if given.fit_row_time and isinstance(found, gyroscope.RotationAlignment):  # times in s stay the same
@@ -192,15 +189,15 @@ def known(given: KnownOptions) -> Answer:
     compared = isinstance(recorded, rsvib_torch.FreeMotion)
     check = _check_motion(given, info, timing, placed, ignore) if compared else None
     if check is not None:
-        results["Motion of the frames"], data["check"] = [check.summary()], _without_curve(check)
+        results["Motion of the frames"], data["check"] = [check.summary()], _without_curves(check)
     # 3. Restoration in windows.
     counts = info.shape[0] > 8
-    of_run = given.of_stack(scale, options) | {"force": given.force, "motion": placed, "manifest": manifest}
+    of_run = given.of_stack(scale, options) | {"force": given.force, "motion": placed}
     of_run |= {name: value for name, value in given.settings.stack.items() if name == "window"} | given.processing
     with working(f"restoring {given.stack.name}", counts=counts) as progress:
         run = stacks.process_stack(given.stack, given.restored, timing, **of_run, progress=progress if counts else None)
     results["Restoration"], data["restoration"] = answers.restoration_of(run, given.restored)
-    return Answer(results, data, [given.restored, manifest])
+    return Answer(results, data, [given.restored, given.manifest])
 
 
 def _recorded(given: KnownOptions) -> rsvib_torch.FreeMotion | rsvib_torch.AngularRates:
@@ -308,8 +305,7 @@ def calibrate(given: CalibrateOptions) -> Answer:
     _check_given(given)
     paths = [given.part_of(path) for path in given.frames]
     if given.out is not None:
-        shared.check_new([given.out], given.overwrite, [file for path in paths for file in io.stack_files(path)])
-        check_writable(given.out)
+        shared.check_file(given.out, given.overwrite, [file for path in paths for file in io.stack_files(path)])
     infos = [io.read_stack_info(path) for path in paths]
     if given.frame_range is None and infos[0].shape[0] > _CALIBRATED_FRAMES:
         note(f"the first {_CALIBRATED_FRAMES} of {infos[0].shape[0]} frames are used; --frames selects others")
@@ -363,7 +359,7 @@ def calibrate(given: CalibrateOptions) -> Answer:
         steps.append(answers.next_step("detect a vibration", *command))
     return Answer(
         {"Camera": [result.summary(), f"{rows} rows are read in {readout} ms"], "Configuration": [table]},
-        {"calibration": _without_curve(result)},
+        {"calibration": _without_curves(result)},
         [] if given.out is None else [given.out],
         steps,
     )

@@ -8,7 +8,7 @@ from dataclasses import replace
 from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -19,7 +19,7 @@ from rsvib_torch.checks.validation import options
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.terminal import note
 from rsvib_torch.config import Config, read_config
-from rsvib_torch.files.atomic import check_outputs
+from rsvib_torch.files.atomic import check_outputs, check_writable
 from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.timing import SensorSection
 from rsvib_torch.options import RestorationOptions, method_options
@@ -207,11 +207,11 @@ class StackCommand(RangeOptions, CameraOptions, DeviceOptions):
         """Options that the functions for stacks have in common."""
         return {"full_scale": scale, "restoration": restoration, "device": str(self.torch_device)}
 
-    def planned_restoration(self, given: Mapping[str, Any] | None = None) -> "tuple[StackInfo, float | None, Table]":
+    def planned_restoration(self, given: Mapping[str, object]) -> "tuple[StackInfo, float | None, Table]":
         """What the file states, its full scale, and options of ``restore``: configured, replaced by those ``given``."""
         info = io.read_stack_info(self.stack)
         scale = full_scale_of(self.stack, info, self.settings, self.full_scale)
-        return info, scale, _restoration_options(info, scale, self.settings.restoration, given or {})
+        return info, scale, _restoration_options(info, scale, dict(self.settings.restoration), dict(given))
 
 
 @options
@@ -243,12 +243,26 @@ class RestorationCommand(StackCommand):
     """Write the restored frames even if they are judged no better than the input."""
 
 
-def restored_argument() -> Any:
-    """The stack that commands write."""
-    return argument(
-        text="Stack to write, with the data type and full scale of the input. The extension selects the format; .mp4 "
-        "and .mkv are videos with the time stamps and the sound of the input."
-    )
+@options
+class RestoredStack(StackCommand):
+    """A command that writes a restored stack of a name, and its manifest beside it."""
+
+    restored: Path = argument()
+    """Stack to write, with the data type and full scale of the input. The extension selects the format; .mp4 and .mkv
+    are videos with the time stamps and the sound of the input."""
+
+    @property
+    def manifest(self) -> Path:
+        """What was detected and restored in each window."""
+        return self.restored.with_name(f"{self.restored.name}.manifest.json")
+
+    def planned_stack(self, given: Mapping[str, object]) -> "tuple[StackInfo, float | None, Table]":
+        """``planned_restoration``, of which the restored stack can be written."""
+        info, scale, options = self.planned_restoration(given)
+        shape = info.restored_as(options.get("scale", 1), options.get("mosaic")).shape
+        shape = (1, *shape[1:]) if options.get("joint") is True else shape
+        io.check_stack_target(self.restored, shape, dtype=info.dtype, full_scale=scale, like=info)
+        return info, scale, options
 
 
 @options
@@ -303,6 +317,12 @@ def check_new(
         raise FileExistsError(f"{found}; choose another name, or replace them with --overwrite")
 
 
+def check_file(path: Path, overwrite: bool, inputs: Iterable[Path | None]) -> None:
+    """``check_new`` for one file, which must be writable."""
+    check_new([path], overwrite, inputs)
+    check_writable(path)
+
+
 def full_scale_of(path: Path, info: "StackInfo", config: Config, option: float | None) -> float | None:
     """Full scale of a stack: from the option, else from the file (or its 8-bit type), else from the configuration."""
     if option is not None or not info.is_integer:
@@ -315,12 +335,9 @@ def full_scale_of(path: Path, info: "StackInfo", config: Config, option: float |
     return info.full_scale
 
 
-def _restoration_options(
-    info: "StackInfo", full_scale: float | None, options: Mapping[str, Any], given: Mapping[str, Any]
-) -> Table:
+def _restoration_options(info: "StackInfo", full_scale: float | None, options: Table, given: Table) -> Table:
     """Options of ``restore``: those of the configuration file, replaced by those ``given`` on the command line."""
-    options, given = dict(options), dict(given)
-    method = given.get("method", options.get("method", "exact"))
+    method: str = (options | given).get("method", "exact")
     if method != options.get("method", "exact"):  # other options belong to the configured method
         options = {name: value for name, value in options.items() if name in ("saturation", *method_options(method))}
     if "optics" in given:
@@ -340,9 +357,3 @@ def _restoration_options(
     if checked.optics is not None:
         restore.check_optics(checked.optics)
     return options
-
-
-def restored_shape(info: "StackInfo", options: Mapping[str, Any]) -> tuple[int, ...]:
-    """Shape of the restored frames of a stack, with options as from ``_restoration_options``."""
-    shape = info.restored_as(options.get("scale", 1), options.get("mosaic")).shape
-    return (1, *shape[1:]) if options.get("joint") is True else shape

@@ -215,10 +215,9 @@ def _detect_windows(given: DetectOptions, info: io.StackInfo, manifest: Path, wi
 
 
 @options
-class RestoreOptions(shared.RestorationCommand):
+class RestoreOptions(shared.RestoredStack, shared.RestorationCommand):
     """Options of ``restore``."""
 
-    restored: Path = shared.restored_argument()
     vibration: Path = option(...)
     """The vibration.json, or manifest.json of windows, written by detect or run."""
     report: Path | None = None
@@ -232,13 +231,12 @@ def restore_frames(given: RestoreOptions) -> Answer:
     unchanged, unless --force is given.
     """
     settings, frames, restored, report = given.settings, given.stack, given.restored, given.report
-    manifest = restored.with_name(f"{restored.name}.manifest.json")
-    outputs = [*io.stack_files(restored), manifest, *([] if report is None else [report])]
+    outputs = [*io.stack_files(restored), given.manifest, *([] if report is None else [report])]
     shared.check_new(outputs, given.overwrite, [*given.inputs, given.vibration])
     check_regular(given.vibration)
     with given.vibration.open("rb") as file:
         of_windows = b'"rsvib stack"' in file.read(200)  # bytes; the format is the first key of either file
-    info, scale, options = given.planned_restoration(given.restoration)
+    info, scale, options = given.planned_stack(given.restoration)
     detected = None
     detections: list[DetectedVibration | None] = []
     if of_windows:
@@ -249,8 +247,6 @@ def restore_frames(given: RestoreOptions) -> Answer:
         timing = io.timing_from_first_frame(settings.timing, info)
         detected, window = reports.read_vibration(given.vibration, timing), max(2, info.shape[0])
         stacks.check_stack_fits(info, options, on_gpu=given.torch_device.type != "cpu")
-    shape = shared.restored_shape(info, options)
-    io.check_stack_target(restored, shape, dtype=info.dtype, full_scale=scale, like=info)
     if report is not None:
         check_writable(report)
     print_notes(info, settings)
@@ -260,9 +256,9 @@ def restore_frames(given: RestoreOptions) -> Answer:
         common["progress"] = progress if of_windows else None
         run = stacks.process_stack(frames, restored, settings.timing, **common)
     lines, data = answers.restoration_of(run, restored)
-    files, first = [restored, manifest], None if run.first is None else run.first.restoration
+    files, first = [restored, run.manifest], None if run.first is None else run.first.restoration
     if detected is None:
-        answer = answers.windows_answer("Vibration", stacks.read_manifest(manifest))
+        answer = answers.windows_answer("Vibration", stacks.read_manifest(run.manifest))
     else:
         answer = Answer({"Vibration": [detected.summary()]}, {"detection": detected.to_dict()})
         answer.next_steps += [answers.page_step(frames, frames.with_name("report"), settings)] * run.restored

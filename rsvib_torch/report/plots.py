@@ -105,19 +105,17 @@ def _panels(width: float, height: float, rows: int = 1, columns: int = 1, **grid
     return figure, figure.subplots(rows, columns, squeeze=False, **grid)
 
 
-def _axes_figure(
-    times: Tensor, curves: Sequence[tuple[Sequence[str], Tensor, str | None]], labels: Sequence[str], **style: object
-) -> Figure:
-    """A panel for x and y each with curves over times in s, and labels of x, of y, and before the name of the axis.
+def _offsets_figure(times: Tensor, curves: Sequence[tuple[Sequence[str], Tensor, str | None]]) -> Figure:
+    """A panel for x and y each with offsets over times in s.
 
-    A curve has its label on both panels, values (N, 2), and a colour (None: that of the axis).
+    Offsets have a label on each panel, values (N, 2), and a colour (None: that of the axis).
     """
     figure, (panels,) = _panels(13, 4.2, 1, 2, sharex=True)
     for axis, (panel, (name, colour)) in enumerate(zip(panels, _AXIS_COLOURS.items(), strict=True)):
         for texts, values, other in curves:
-            panel.plot(1e3 * times.cpu(), values[:, axis].cpu(), color=other or colour, label=texts[axis], **style)
+            panel.plot(1e3 * times, values[:, axis], ".", color=other or colour, label=texts[axis])
         panel.legend(**_LEGEND_ABOVE, ncols=len(curves))
-        plain_axes(panel, *labels[:2], heading=f"{labels[2]} {name}")
+        plain_axes(panel, _OFFSET_TIME, "offset (px)", heading=f"Offset along {name}")
     return figure
 
 
@@ -351,7 +349,7 @@ def _detected_motion_figure(result: detection.MotionDetection | detection.SweptT
     else:
         figure, ((panel,),) = _panels(8, 3.6)
         for frame, (times, *values) in enumerate(zip(result.times, result.displacement, result.std, strict=True)):
-            _plot_axes(panel, 1e3 * times.cpu(), *values, legend=frame == 0)
+            _plot_axes(panel, 1e3 * times, *values, legend=frame == 0)
         plain_axes(panel, "time (ms)", "displacement (px)")
     lines = [  # which axes are not reliable, with the first reason
         textwrap.shorten(f"{name}: not reliable: {reasons[0]}", 100, placeholder=" …")
@@ -373,12 +371,12 @@ def _verdict_figure(verdict: RestorationVerdict) -> Figure:
     titles = ("displacement along x (px rms)", "displacement along y (px rms)", "estimated improvement (dB)")
     for axis, (panel, title) in enumerate(zip(panels, titles, strict=True)):
         for values, style, colour, label in curves if axis < 2 else ():
-            panel.plot(values[:, axis].cpu(), style, color=colour, markersize=4, label=label)
+            panel.plot(values[:, axis], style, color=colour, markersize=4, label=label)
         panel.xaxis.get_major_locator().set_params(integer=True)
         plain_axes(panel, "pair of frames", title=title)
         panel.set_ylim(bottom=0 if axis < 2 else None)
     panels[0].legend(**_LEGEND)
-    panels[2].plot(verdict.predicted_gain.cpu(), "o-", color=_X_COLOUR, markersize=4)
+    panels[2].plot(verdict.predicted_gain, "o-", color=_X_COLOUR, markersize=4)
     panels[2].axhline(0.0, color=_GREY, linewidth=0.8)
     return figure
 
@@ -604,23 +602,20 @@ def picture(frame: Tensor) -> Tensor:
 
 def _restoration_mtf_figure(result: RestorationMtf) -> Figure:
     figure, ((panel,),) = _panels(5.6, 3.9)
-    frequency = result.frequency.cpu().numpy()
-    for name, values, limit in zip("xy", result.mtf.cpu().numpy(), result.resolution.tolist(), strict=True):
+    for name, values, limit in zip("xy", result.mtf, result.resolution.tolist(), strict=True):
         label = f"{name}: 0.5 at {limit:.2f} cycles/px"
-        panel.plot(frequency, values, color=_AXIS_COLOURS[name], linewidth=2.0, label=label)
-    _finish_mtf(panel, float(frequency[-1]), "MTF of the restoration", f"noise gain {result.noise_gain:.2f}")
+        panel.plot(result.frequency, values, color=_AXIS_COLOURS[name], linewidth=2.0, label=label)
+    _finish_mtf(panel, float(result.frequency[-1]), "MTF of the restoration", f"noise gain {result.noise_gain:.2f}")
     return figure
 
 
 def _measured_offsets_figure(curve: OffsetCurve) -> Figure:
     """Draw the measured offsets of each axis, with error bars of one standard deviation if they are known."""
     times, offsets = curve.times[curve.good], curve.offsets[curve.good]
-    labels = (_OFFSET_TIME, "offset (px)", "Offset along")
-    figure = _axes_figure(times, [(("measured",) * 2, offsets, None)], labels, marker=".", linestyle="none")
-    for axis, panel in enumerate(figure.axes if curve.std is not None else ()):
-        assert curve.std is not None
-        x, y, std = (values.cpu() for values in (1e3 * times, offsets[:, axis], curve.std[curve.good][:, axis]))
-        panel.errorbar(x, y, std, fmt="none", ecolor=_GRID, zorder=1)
+    figure = _offsets_figure(times, [(("measured",) * 2, offsets, None)])
+    if curve.std is not None:
+        for panel, values, std in zip(figure.axes, offsets.T, curve.std[curve.good].T, strict=True):
+            panel.errorbar(1e3 * times, values, std, fmt="none", ecolor=_GRID, zorder=1)
     return figure
 
 
@@ -631,8 +626,8 @@ def _calibration_figure(result: RowTimeCalibration) -> Figure:
     shown = min(4, len(result.light))
     figure, panels = _panels(8, 0.9 + 1.7 * shown, shown, sharex=True, sharey=True)
     for frame, panel in enumerate(panels[:, 0]):
-        panel.plot(result.light[frame].cpu(), ".", color=_GREY, markersize=2.5, label="measured rows")
-        panel.plot(result.fitted_light[frame].cpu(), color=_FIT_COLOUR, linewidth=1.3, label="fitted bands")
+        panel.plot(result.light[frame], ".", color=_GREY, markersize=2.5, label="measured rows")
+        panel.plot(result.fitted_light[frame], color=_FIT_COLOUR, linewidth=1.3, label="fitted bands")
         plain_axes(panel, "row" if frame == shown - 1 else "", "light / mean", title=f"frame {frame}")
     panels[0, 0].legend(**_LEGEND_ABOVE, ncols=2)
     return figure
@@ -646,14 +641,14 @@ def _spectrum_figure(result: detection.DisplacementSpectrum) -> Figure:
     """Draw amplitude spectrum and power spectral density of each axis, their noise, and the blind bands in grey."""
     axes = len(result.amplitude)
     figure, panels = _panels(6.5 * axes, 6.4, 2, axes, sharex=True)
-    frequency, half = result.frequency.cpu().numpy(), 0.25 * result.resolution  # half of a step
+    frequency, half = result.frequency.numpy(), 0.25 * result.resolution  # half of a step
     # first and last of each run of blind neighbours
-    runs = true_runs(result.blind.cpu().numpy()) - [0, 1]
+    runs = true_runs(result.blind.numpy()) - [0, 1]
     for axis, name in enumerate(AXIS_NAMES[:axes]):
         unit, colour = AXIS_UNITS[axis], _AXIS_COLOURS.get(name, _INK)
         curves = ((result.amplitude, result.noise, unit), (result.psd, result.noise_psd, f"{unit}²/Hz"))
         for panel, (of_axes, of_noise, unit_of_panel) in zip(panels[:, axis], curves, strict=True):
-            values, noise = of_axes[axis].cpu().numpy(), of_noise[axis].cpu().numpy()
+            values, noise = of_axes[axis].numpy(), of_noise[axis].numpy()
             for first, last in frequency[runs]:
                 panel.axvspan(first - half, last + half, color=_BLIND_COLOUR, linewidth=0)
             panel.plot(frequency, values, color=colour, linewidth=0.8)
@@ -686,30 +681,29 @@ def _spectrum_figure(result: detection.DisplacementSpectrum) -> Figure:
 
 def _check_figure(result: gyroscope.MotionCheck) -> Figure:
     """Draw the offsets of row bands of each axis, before and after a motion is subtracted."""
-    before, after = ([measured_text(rms, digits=3) for rms in of_axes] for of_axes in (result.before, result.after))
-    before, after = [f"offsets {rms} px rms" for rms in before], [f"without the motion {rms} px rms" for rms in after]
-    curves = ((before, result.offsets, _GREY), (after, result.residual, None))
-    labels = (_OFFSET_TIME, "offset (px)", "Offset along")
-    return _axes_figure(result.times, curves, labels, marker=".", linestyle="none")
+    before = [f"offsets {measured_text(rms, digits=3)} px rms" for rms in result.before]
+    after = [f"without the motion {measured_text(rms, digits=3)} px rms" for rms in result.after]
+    return _offsets_figure(result.times, ((before, result.offsets, _GREY), (after, result.residual, None)))
 
 
 def _rotation_figure(result: gyroscope.RotationAlignment) -> Figure:
     """Draw X, Y and roll from frame to frame, measured in the images and by the gyroscope, and their differences."""
     figure, panels = _panels(8, 7.2, 3, sharex=True)
-    times = result.times.cpu()
     for axis, (name, unit, factor) in enumerate((("x", "px", 1.0), ("y", "px", 1.0), ("roll", "mrad", 1e3))):
-        measured, predicted = factor * result.measured[:, axis].cpu(), factor * result.predicted[:, axis].cpu()
-        rms = float((measured - predicted).square().mean().sqrt())
+        measured, predicted = factor * result.measured[:, axis], factor * result.predicted[:, axis]
+        difference = measured - predicted
+        rms = float(difference.square().mean().sqrt())
         panel = panels[axis, 0]
-        panel.plot(times, predicted, color=_FIT_COLOUR, linewidth=1.3, label="gyroscope")
-        panel.plot(times, measured, "o", color=_X_COLOUR, markersize=3.5, label="frames")
-        panel.plot(times, measured - predicted, color=_GREY, linewidth=1.0, label=f"difference, {rms:.3g} {unit} rms")
+        panel.plot(result.times, predicted, color=_FIT_COLOUR, linewidth=1.3, label="gyroscope")
+        panel.plot(result.times, measured, "o", color=_X_COLOUR, markersize=3.5, label="frames")
+        panel.plot(result.times, difference, color=_GREY, linewidth=1.0, label=f"difference, {rms:.3g} {unit} rms")
         panel.legend(**_LEGEND_ABOVE, ncols=3)
         heading = "Between consecutive frames" if axis == 0 else ""
         plain_axes(panel, "" if axis < 2 else "time (s)", f"{name} ({unit})", heading=heading)
     return figure
 
 
+# of results on the CPU, without gradients
 FIGURES.update(
     {
         (DetectionResult, 0): offset_figure,

@@ -25,7 +25,7 @@ from rsvib_torch.files.atomic import write_json
 from rsvib_torch.files.reading import Table
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.results.higher_packages import imported
-from rsvib_torch.results.reason import texts
+from rsvib_torch.results.reason import Findings, texts
 from rsvib_torch.results.result_files import figure_png, result_of, write_figure
 from rsvib_torch.text import AXES, data_uri, text_table, wrapped
 
@@ -60,7 +60,7 @@ def verdict_table(
     rows: Sequence[Sequence[str]],
     batch_shape: Sequence[int],
     reliable: Tensor,
-    reasons: tuple[Any, ...],
+    reasons: Sequence[Any],
 ) -> list[str]:
     """A table with rows that begin as in ``axis_rows``, and the verdict: lines with reasons, or a column in a batch."""
     head = [*axis_head(batch_shape), *head]
@@ -317,7 +317,8 @@ class Result(Summarised):
             elif isinstance(value, Result):
                 object.__setattr__(result, name, value.mapped(function))
             elif isinstance(value, dict):
-                object.__setattr__(result, name, {key: function(entry) for key, entry in value.items()})
+                changed = {key: function(one) if isinstance(one, Tensor) else one for key, one in value.items()}
+                object.__setattr__(result, name, changed)
         return result
 
     def to(self, device: torch.device | str) -> Self:
@@ -333,7 +334,7 @@ class Result(Summarised):
                 shape = tuple(self.batch_shape)
                 raise ValueError(f"a batch of shape {shape} has no figure: select one, result[0].plot()")
             raise TypeError(f"{type(self).__name__} has no figure; these have one: {', '.join(drawn)}")
-        figure = draw(self)
+        figure = draw(self.mapped(lambda values: values.detach().cpu()))
         if path is not None:
             write_figure(figure, path)
         return figure
@@ -352,7 +353,7 @@ class Result(Summarised):
 class JudgedResult(Result):
     """A result with a verdict. Its field ``findings`` has the ``Reason`` objects against it, or against each axis."""
 
-    findings: tuple[Any, ...]
+    findings: Findings
 
     @property
     def reasons(self) -> tuple[Any, ...]:

@@ -6,14 +6,17 @@ is written from the table.
 
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
+from operator import attrgetter
 from string import Formatter
 from typing import Any
 
 from rsvib_torch.text import quoted
+
+Findings = tuple[Any, ...]  # reasons, or such a tuple for each axis, or for each result of a batch
 
 
 @dataclass(frozen=True)
@@ -133,16 +136,12 @@ def options_of_the_program() -> Iterator[None]:
 _AT_RADIUS = "[ (px: at {radius:.0f} px from the centre)]"  # for components of roll and zoom
 
 
-def texts(findings: tuple[Any, ...]) -> tuple[Any, ...]:
+def texts(findings: Findings, text: Callable[[Reason], str] = attrgetter("with_axis")) -> tuple[Any, ...]:
     """Texts of reasons: of those in the tuple of an axis without its name, of others with it."""
-
-    def without_axis(findings: tuple[Any, ...]) -> tuple[Any, ...]:
-        return tuple(str(one) if isinstance(one, Reason) else without_axis(one) for one in findings)
-
-    return tuple(one.with_axis if isinstance(one, Reason) else without_axis(one) for one in findings)
+    return tuple(text(one) if isinstance(one, Reason) else texts(one, str) for one in findings)
 
 
-def read_findings(values: Any) -> Any:
+def read_findings(values: object) -> Reason | Findings:
     """Reasons in nested lists as JSON files have them."""
     if isinstance(values, Mapping):
         return Reason.from_dict(values)

@@ -156,9 +156,8 @@ def test_json_of_restore_known_and_simulate(place, config, tmp_path, capsys):
     answer = json.loads(capsys.readouterr().out)
     assert answer["check"]["helps"] is True
     assert answer["restoration"]["predicted_gain_db"] > 10
-    (tmp_path / "c.toml").write_text(CAMERA + "[simulation]\nframe_size = [96, 64]\n[simulation.vibration]\n")
-    text = "amplitude = [1.0, 2.0]\nfrequency = [130.0, 90.0]\nphase = [0.0, 0.0]\n"
-    (tmp_path / "c.toml").write_text((tmp_path / "c.toml").read_text() + text)
+    vibration = "[simulation.vibration]\namplitude = [1.0, 2.0]\nfrequency = [130.0, 90.0]\n"
+    (tmp_path / "c.toml").write_text(CAMERA + "[simulation]\nframe_size = [96, 64]\n" + vibration)
     assert rsvib("simulate", place / "scene.png", tmp_path / "s.tif", "--config", tmp_path / "c.toml", "--json") == 0
     answer = json.loads(capsys.readouterr().out)
     assert answer["vibration"]["amplitude"] == [[1.0], [2.0]]

@@ -2,6 +2,7 @@
 
 import json
 import os
+import warnings
 
 import pytest
 from program import refused, rsvib
@@ -26,10 +27,12 @@ def camera(tmp_path, monkeypatch):
 
 @pytest.fixture
 def failing(tmp_path, monkeypatch):
-    """Makes a file whose format has a reader that raises an error."""
+    """Makes a file whose format has a reader that raises an error, after a warning."""
 
-    def make(error):
+    def make(error, warning=None):
         def fail(_):
+            if warning is not None:
+                warnings.warn(warning, UserWarning, stacklevel=1)
             raise error
 
         monkeypatch.setitem(formats.FORMATS, ".fail", StackFormat("failing", (".fail",), fail))
@@ -55,6 +58,16 @@ def test_unforeseen_errors_are_one_line(error, line, camera, failing, capsys):
     shown = capsys.readouterr().err
     assert "Traceback (most recent call last)" in shown
     assert shown.splitlines()[-1].startswith(f"rsvib: error: {line}")
+
+
+def test_warnings_are_one_line(camera, failing, capsys):
+    failing(ValueError("stopped here"), "the displacement within a row time\nis large")
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        assert rsvib("run", "frames.fail", "out", *camera) == 2
+    assert capsys.readouterr().err == (
+        "rsvib: warning: the displacement within a row time is large\nrsvib: error: stopped here\n"
+    )
 
 
 def test_functions_raise_errors_of_the_program_unchanged(tmp_path, failing):

@@ -102,10 +102,3 @@ def test_a_file_whose_name_looks_like_a_part_is_read_as_a_whole(place, tmp_path)
     for index, frame in enumerate(tifffile.imread(place / "part.tif")):
         tifffile.imwrite(folder / f"{index}.tif", frame)
     assert rsv.read_stack_info(folder).shape[0] == 4
-
-
-def test_a_camera_has_no_range(capsys):
-    camera = ("--row-time", "1e-4", "--exposure", "1e-3", "--frame-rate", "30")
-    assert "--frames goes with a file, not with 0; --num-frames ends a session" in refused(
-        capsys, "live", "0", *camera, *RANGE
-    )

@@ -68,30 +68,18 @@ def test_vibration_of_another_timing_is_refused(tmp_path, result, timing):
     assert str(caught.value).count("(here") == 1
 
 
-def drop(data, *keys):
-    for key in keys[:-1]:
-        data = data[key]
-    del data[keys[-1]]
-
-
-def put(data, value, *keys):
-    for key in keys[:-1]:
-        data = data[key]
-    data[keys[-1]] = value
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda d: drop(d, "vibration"), "vibration: missing key"),
-        (lambda d: drop(d, "timing", "frame_rows"), "timing.frame_rows: missing key"),
-        (lambda d: drop(d, "reliable"), "reliable: missing key"),
-        (lambda d: put(d, math.nan, "vibration", "amplitude", 0, 0), "not a vibration.json: NaN is not a JSON number"),
-        (lambda d: put(d, None, "vibration", "amplitude", 0, 0), "vibration: amplitude must be finite"),
-        (lambda d: put(d, "3", "vibration", "frequency", 0, 0), "vibration.frequency: expected numbers in lists"),
-        (lambda d: put(d, 2, "version"), "expected format 'rsvib vibration' of version 1"),
-        (lambda d: put(d, "rsvib windows", "format"), "not a vibration.json, but a file of the format 'rsvib windows'"),
-        (lambda d: put(d, [[1.0], [2.0, 3.0]], "gain"), "gain: expected numbers in lists of equal lengths"),
+        (lambda d: d.pop("vibration"), "vibration: missing key"),
+        (lambda d: d["timing"].pop("frame_rows"), "timing.frame_rows: missing key"),
+        (lambda d: d.pop("reliable"), "reliable: missing key"),
+        (lambda d: d["vibration"]["amplitude"][0].append(math.nan), "not a vibration.json: NaN is not a JSON number"),
+        (lambda d: d["vibration"].update(amplitude=[[None, 0.5], [1.0, 0.0]]), "vibration: amplitude must be finite"),
+        (lambda d: d["vibration"].update(frequency=[["3"]]), "vibration.frequency: expected numbers in lists"),
+        (lambda d: d.update(version=2), "expected format 'rsvib vibration' of version 1"),
+        (lambda d: d.update(format="rsvib windows"), "not a vibration.json, but a file of the format 'rsvib windows'"),
+        (lambda d: d.update(gain=[[1.0], [2.0, 3.0]]), "gain: expected numbers in lists of equal lengths"),
     ],
 )
 def test_malformed_vibration_files_are_refused(tmp_path, result, change, message):

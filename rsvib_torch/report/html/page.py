@@ -1,11 +1,9 @@
 """The report page of a stack of frames: verdict, comparison, measured offsets, vibration and sharpness."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from datetime import datetime
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,7 +12,6 @@ from rsvib_torch.detection import DetectionResult
 from rsvib_torch.evaluation import MtfCurve, find_slanted_edges, slanted_edge_mtf
 from rsvib_torch.files.reading import Table
 from rsvib_torch.frames.pixels import enlarged
-from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.report import plots
 from rsvib_torch.report.html import words
@@ -28,38 +25,12 @@ from rsvib_torch.report.html.template import (
     drawing,
     write_page,
 )
-from rsvib_torch.restoration import RestorationVerdict, trusted_vibration
+from rsvib_torch.report.html.words import Report
+from rsvib_torch.restoration import trusted_vibration
 from rsvib_torch.results.presentation import AXIS_NAMES, AXIS_UNITS
-from rsvib_torch.results.reason import Reason
-from rsvib_torch.stacks import StackManifest
 from rsvib_torch.text import measured_text
 
 Box = tuple[int, int, int, int]  # top, left, height, width in px
-
-
-@dataclass(frozen=True, eq=False)
-class Report:
-    """Content of a report page."""
-
-    title: str  # heading
-    subtitle: str  # line below
-    frames: Tensor  # (T, H, W) or (T, C, H, W) input frames, full scale 1
-    # frames after restoration, or one frame restored jointly from all; on a finer grid with as many times the rows and
-    # columns
-    restored: Tensor
-    was_restored: bool  # whether ``restored`` is restored, or the unchanged input
-    timing: SensorTiming  # the sensor
-    version: str  # version of the package
-    # the detection (not a batch); None: the frames are those of a run that followed the vibration, with ``windows``
-    detection: DetectionResult | None = None
-    verdict: RestorationVerdict | None = None  # comparison of pairs of frames; None if they could not be compared
-    left_alone: tuple[Reason, ...] = ()  # a reason for each axis that was not restored
-    options: Table = field(default_factory=dict)  # options of ``restore``
-    first: int = 0  # number of the first of the frames
-    next_steps: tuple[str, ...] = ()  # what to do next: sentences, with the command that does it on a line of its own
-    command: str | None = None  # the command line that wrote the page; None for a page written from Python
-    windows: StackManifest | None = None  # windows of the stack that were processed separately; None if there are none
-    created: datetime = field(default_factory=lambda: datetime.now().astimezone())  # time at which the page was made
 
 
 @dataclass(frozen=True)
@@ -170,7 +141,7 @@ def whole_frame(report: Report, index: int, frames: tuple[Tensor, ...], names: t
     return replace(pair, caption=f"{caption}. Grey levels are stretched: {levels}{both}.")
 
 
-def frames_in_turn(report: Report, index: int, image_motion: Tensor, size: int = 480) -> Blink | None:
+def frames_in_turn(report: Report, index: int, image_motion: Tensor) -> Blink | None:
     """Two consecutive frames before and after restoration, at full resolution where detail is strongest.
 
     Uniform motion along the image is compensated by whole px, the same for input and restored frames, so that the
@@ -190,7 +161,7 @@ def frames_in_turn(report: Report, index: int, image_motion: Tensor, size: int =
     if min(rows, columns) < 32:  # px; the two frames have too little in common
         return None
     top, left = max(0, -moved[1]), max(0, -moved[0])  # of the part of the first frame that both contain
-    size = min(size, rows, columns)
+    size = min(480, rows, columns)  # px
     common = _grey(frames[-1][first])[top : top + rows, left : left + columns]
     row, column = plots.detailed_places(common.float(), size, count=1, rim=16)[0]
     row, column = row + top, column + left
@@ -210,17 +181,17 @@ def frames_in_turn(report: Report, index: int, image_motion: Tensor, size: int =
     return blink(pairs, names=names, frames=(number, number + 1), caption=caption)
 
 
-def _figures_of(result: DetectionResult, removed: Vibration, timing: SensorTiming, num_rows: int) -> dict[str, Drawing]:
+def _figures_of(report: Report, result: DetectionResult, removed: Vibration) -> dict[str, Drawing]:
     """Figures of a detection, and of the part ``removed`` of its vibration, by the name of their file."""
     figures = {
         f"offsets_{name}": drawing(plots.offset_panels(result, [axis], 5.6, 4.4)[0])
         for axis, name in enumerate(AXIS_NAMES[: result.vibration.num_axes])
     }
-    figures["offset_gain"] = drawing(plots.gain_figure(result, timing))
+    figures["offset_gain"] = drawing(plots.gain_figure(result, report.timing))
     centre = removed.translation()
     if bool(centre.moving_axes().any()):
-        figures["rows"] = drawing(plots.rows_figure(centre, timing, num_rows))
-        figures["psf"] = drawing(plots.psf_figure(centre, timing, num_rows))
+        figures["rows"] = drawing(plots.rows_figure(centre, report.timing, report.num_rows))
+        figures["psf"] = drawing(plots.psf_figure(centre, report.timing, report.num_rows))
     return figures
 
 
@@ -232,7 +203,6 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
     result, timing = report.detection, report.timing
     points, finer = report.restored.shape[-1] // report.frames.shape[-1], report.restored
     report = replace(report, restored=finer[..., ::points, ::points])
-    num_rows = report.frames.shape[int(timing.scan_axis)]
     index = len(report.frames) // 2 if len(report.restored) < len(report.frames) else 0
     before = report.frames[index]
     last = min(index, len(report.restored) - 1)
@@ -242,7 +212,7 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
     names = ("input", "restored")[: len(shown)]
     measured, notes = measure_edges(_grey(before), _grey(detail), edges)
     figures: dict[str, Drawing] = {}
-    detected: dict[str, Any] = {"tried": [], "residuals": []}
+    detected: Table = {"tried": [], "residuals": []}
     for direction in sorted({edge.direction for edge in measured}):
         chosen = [edge for edge in measured if edge.direction == direction]
         curves = [[one.before for one in chosen if one.before is not None], [one.after for one in chosen]]
@@ -257,17 +227,15 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
         sentences, shape = [words.FOLLOWED], report.windows.input["shape"]
         motion = torch.zeros(2) if followed is None else followed.vibration.image_motion[report.first]
     else:
-        removed = trusted_vibration(result, timing, len(report.frames), num_rows)[0].to("cpu")
+        removed = trusted_vibration(result, timing, len(report.frames), report.num_rows)[0].to("cpu")
         motion = removed.image_motion
-        sentences = words.verdict_sentences(
-            result, removed, timing, num_rows, restored=restored, left_alone=report.left_alone, verdict=report.verdict
-        )
+        sentences = words.verdict_sentences(report, result, removed)
         if not restored and report.windows is not None and report.windows.totals()["restored"]:
             sentences[0] = words.WINDOWS_RESTORED
-        mark = words.overall_result(result, report.verdict, restored)[0]
+        mark = words.overall_result(report, result)[0]
         if not restored:
-            detected["tried"] = words.tried_sentences(result, report.options, report.verdict, sentences[1:])
-        figures |= _figures_of(result, removed, timing, num_rows)
+            detected["tried"] = words.tried_sentences(report, result, sentences[1:])
+        figures |= _figures_of(report, result, removed)
         detected["residuals"] = [
             (name, f"{float(result.residual[axis]):.3g} {AXIS_UNITS[axis]}")
             for axis, name in enumerate(AXIS_NAMES[: result.vibration.num_axes])
@@ -283,7 +251,6 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
             figures["windows"] = drawing(report.windows.plot())
     content = {
         "report": report,
-        "title": report.title,
         "mark": mark,
         "verdict": sentences if restored else sentences[:1],
         **detected,
@@ -297,10 +264,10 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
         "mtf_rows": [edge.row(restored) for edge in measured],
         "mtf_notes": notes,
         "camera": words.camera_rows(timing, shape),
-        "about": words.about_rows(report.created, report.version, report.command, report.options if restored else {}),
+        "about": words.about_rows(report),
         "terms": words.TERMS,
     }
-    write_page(folder / "report.html", "report.html", content)
+    write_page(folder / "report.html", content)
     for name, figure in figures.items():
         (folder / f"{name}.png").write_bytes(figure.png)
     return ["report.html", *(f"{name}.png" for name in figures)]

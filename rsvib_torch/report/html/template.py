@@ -1,9 +1,9 @@
 """Self-contained HTML pages: images as data URIs, and templates that escape all text."""
 
-import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -160,8 +160,8 @@ def _explained(text: str, terms: Mapping[str, str]) -> Markup:
     )
 
 
-def write_page(path: str | os.PathLike[str], template: str, content: Table) -> None:
-    """Write a page from a template of the package; text is escaped."""
+def write_page(path: Path, content: Table) -> None:
+    """Write the page from the template of the package; text is escaped."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("rsvib_torch.report.html"),
         autoescape=True,
@@ -170,6 +170,6 @@ def write_page(path: str | os.PathLike[str], template: str, content: Table) -> N
         lstrip_blocks=True,
     )
     environment.filters["explained"] = _explained
-    text = environment.get_template(template).render(**content)
+    text = environment.get_template("report.html").render(**content)
     with whole_file(path) as part:
         part.write_text(text, encoding="utf-8")

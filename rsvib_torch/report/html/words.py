@@ -1,9 +1,12 @@
-"""Sentences and tables of a report page."""
+"""Content of a report page, and its sentences and tables."""
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Literal
+
+from torch import Tensor
 
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.files.reading import Table
@@ -13,6 +16,7 @@ from rsvib_torch.report.plots import motion_blur, tones_text
 from rsvib_torch.restoration import RestorationVerdict
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
+from rsvib_torch.stacks import StackManifest
 from rsvib_torch.text import measured_text
 
 Mark = Literal["good", "doubt", "bad"]
@@ -59,13 +63,43 @@ FOLLOWED = (
 )
 
 
-def overall_result(result: DetectionResult, verdict: RestorationVerdict | None, restored: bool) -> tuple[Mark, str]:
+@dataclass(frozen=True, eq=False)
+class Report:
+    """Content of a report page."""
+
+    title: str  # heading
+    subtitle: str  # line below
+    frames: Tensor  # (T, H, W) or (T, C, H, W) input frames, full scale 1
+    # frames after restoration, or one frame restored jointly from all; on a finer grid with as many times the rows and
+    # columns
+    restored: Tensor
+    was_restored: bool  # whether ``restored`` is restored, or the unchanged input
+    timing: SensorTiming  # the sensor
+    version: str  # version of the package
+    # the detection (not a batch); None: the frames are those of a run that followed the vibration, with ``windows``
+    detection: DetectionResult | None = None
+    verdict: RestorationVerdict | None = None  # comparison of pairs of frames; None if they could not be compared
+    left_alone: tuple[Reason, ...] = ()  # a reason for each axis that was not restored
+    options: Table = field(default_factory=dict)  # options of ``restore``
+    first: int = 0  # number of the first of the frames
+    next_steps: tuple[str, ...] = ()  # what to do next: sentences, with the command that does it on a line of its own
+    command: str | None = None  # the command line that wrote the page; None for a page written from Python
+    windows: StackManifest | None = None  # windows of the stack that were processed separately; None if there are none
+    created: datetime = field(default_factory=lambda: datetime.now().astimezone())  # time at which the page was made
+
+    @property
+    def num_rows(self) -> int:
+        """Rows of a frame, along the scan axis."""
+        return self.frames.shape[int(self.timing.scan_axis)]
+
+
+def overall_result(report: Report, result: DetectionResult) -> tuple[Mark, str]:
     """Overall result, which selects the colour of the verdict, and its sentence."""
-    if not restored and verdict is None:
+    if not report.was_restored and report.verdict is None:
         return "doubt", "No vibration was detected that can be removed; the frames are unchanged."
-    if not restored:
+    if not report.was_restored:
         return "bad", "Restoration does not improve the frames; they are unchanged."
-    outcome = "unknown" if verdict is None else verdict.overall
+    outcome = "unknown" if report.verdict is None else report.verdict.overall
     if not bool(result.reliable.any()) or outcome == "worse":
         return "bad", "The detected vibration is not reliable; inspect the restored frames before you use them."
     if outcome == "unknown":
@@ -76,21 +110,12 @@ def overall_result(result: DetectionResult, verdict: RestorationVerdict | None, 
     return "doubt", "The vibration was measured and removed in part."
 
 
-def verdict_sentences(
-    result: DetectionResult,
-    removed: Vibration,
-    timing: SensorTiming,
-    num_rows: int,
-    *,
-    restored: bool,
-    left_alone: Sequence[Reason],
-    verdict: RestorationVerdict | None,
-) -> list[str]:
+def verdict_sentences(report: Report, result: DetectionResult, removed: Vibration) -> list[str]:
     """The verdict: one sentence for the overall result, followed by the details.
 
-    ``removed`` is the part of the detected vibration that was removed; ``left_alone`` has a reason for each other axis.
+    ``removed`` is the part of the detected vibration that was removed.
     """
-    sentences = [overall_result(result, verdict, restored)[1]]
+    sentences = [overall_result(report, result)[1]]
     for axis, name in enumerate(AXIS_NAMES[: result.vibration.num_axes]):
         if bool(result.reliable[axis]):
             sentences.append(f"The vibration along {name} is {' and '.join(tones_text(result, axis)) or 'none'}.")
@@ -105,23 +130,21 @@ def verdict_sentences(
     removed = removed.translation()  # at the centre of the frame
     if bool(removed.moving_axes().any()):
         size = removed.amplitude.sum(-1)
-        blur = motion_blur(removed, timing.row_starts(1, num_rows)[0], timing).amax(0)
+        blur = motion_blur(removed, report.timing.row_starts(1, report.num_rows)[0], report.timing).amax(0)
         sentences.append(
             f"Rows are displaced by up to {float(size[0]):.2f} px along x and {float(size[1]):.2f} px along y, and "
             f"blurred by up to {float(blur[0]):.2f} px and {float(blur[1]):.2f} px during their exposure."
         )
     if bool(result.reliable.all()):  # otherwise the reasons are given above
-        sentences += [_sentence(str(reason)) for reason in left_alone]
-    if verdict is not None:
-        sentences.append(_sentence(verdict.sentence))
-    elif restored:
+        sentences += [_sentence(str(reason)) for reason in report.left_alone]
+    if report.verdict is not None:
+        sentences.append(_sentence(report.verdict.sentence))
+    elif report.was_restored:
         sentences.append("No two frames have enough of the scene in common to judge the restoration.")
     return sentences
 
 
-def tried_sentences(
-    result: DetectionResult, options: Table, verdict: RestorationVerdict | None, found: Sequence[str]
-) -> list[str]:
+def tried_sentences(report: Report, result: DetectionResult, found: Sequence[str]) -> list[str]:
     """What was tried where no frame was restored: the detection, its findings ``found``, and the restoration."""
     curve = result.offsets
     pairs, rows = curve.offsets.shape[-3:-1]
@@ -131,18 +154,22 @@ def tried_sentences(
         "them successfully), and sinusoids were fitted to them along both axes.",
         *found,
     ]
-    if verdict is None:
+    if report.verdict is None:
         return [*sentences, "Frames were not restored, because along no axis a vibration is known accurately enough."]
-    chosen = ", ".join(f"{name} = {value}" for name, value in options.items())
+    chosen = _chosen(report)
     return [*sentences, f"Frames were restored{f' with {chosen}' * bool(chosen)} and judged; they are not written."]
 
 
-def about_rows(created: datetime, version: str, command: str | None, options: Table) -> list[list[str]]:
+def about_rows(report: Report) -> list[list[str]]:
     """Lines of the table of the report itself: when and how it was made."""
-    chosen = ", ".join(f"{name} = {value}" for name, value in options.items())
-    rows = {"created": created.isoformat(" ", "seconds"), "program": f"rsvib_torch {version}"}
-    rows |= {"command": command or "", "restored with": chosen}
+    rows = {"created": report.created.isoformat(" ", "seconds"), "program": f"rsvib_torch {report.version}"}
+    rows |= {"command": report.command or "", "restored with": _chosen(report) if report.was_restored else ""}
     return [[name, text] for name, text in rows.items() if text]
+
+
+def _chosen(report: Report) -> str:
+    """Options of the restoration."""
+    return ", ".join(f"{name} = {value}" for name, value in report.options.items())
 
 
 def _sentence(text: str) -> str:
