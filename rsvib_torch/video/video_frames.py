@@ -171,7 +171,7 @@ class VideoFrames:
         if saturation is not None and self.picture is not None:
             black, white = self.picture.levels
             saturation = (black + saturation * (white - black)) / 255.0
-        if self.options.method not in WITH_SATURATION:
+        if options.method not in WITH_SATURATION:
             saturation = None
         prepared = prepare_frames(images, timing, saturation=saturation, channels="first")
         with torch.no_grad():
