@@ -99,6 +99,7 @@ def field_start(
     """
     frames, valid, width = stacks.images, stacks.valid, stacks.images.shape[-1]
     count = _num_strips(width)
+    check_frame_size(frames.shape[-2], width, options, count)
     part = round(width / count)  # px
     firsts = tuple(round(number * (width - part) / (count - 1)) for number in range(count))
     strips = ColumnStrips(width, part, firsts, tuple(first + 0.5 * (part - 1) for first in firsts))

@@ -174,7 +174,11 @@ class StackInfo(Summarised):
             return self
         channels = self.shape[1:-2] if mosaic is None else (3,)
         shape = (self.shape[0], *channels, scale * self.shape[-2], scale * self.shape[-1])
-        return replace(self, shape=shape, path=None, metadata=self.metadata_for(shape))
+        resolution = None
+        if self.resolution is not None:
+            x, y, unit = self.resolution
+            resolution = (scale * x, scale * y, unit)
+        return replace(self, shape=shape, path=None, resolution=resolution, metadata=self.metadata_for(shape))
 
     def metadata_for(self, shape: tuple[int, ...], dtype: str | None = None) -> dict[str, Tag | None]:
         """The metadata of a stack of another shape or data type: None for those that are not valid for it."""

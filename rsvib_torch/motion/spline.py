@@ -146,7 +146,8 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         first, last = float(grid[0]), float(grid[-1])
         if (last - first) / step > MAX_KNOTS:
             raise ValueError(f"spacing must give at most {MAX_KNOTS:,} knots, got {step:g} s for {last - first:g} s")
-        even = np.linspace(first, last, max(4, math.ceil((last - first) / step) + 1))
+        intervals = math.ceil((last - first) / step - 1e-6)  # a whole number for even times, but for rounding
+        even = np.linspace(first, last, max(4, intervals + 1))
         interpolated = CubicSpline(grid.numpy(), values.numpy())(even)
         return cls.through(torch.from_numpy(even), torch.from_numpy(interpolated), tones, camera)
 

@@ -167,14 +167,15 @@ def _needed_size(options: RegistrationOptions) -> tuple[int, int]:
     return options.band_rows + 2 * options.search, 4 * (options.search + 8)
 
 
-def check_frame_size(num_rows: int, width: int, options: RegistrationOptions) -> None:
-    """Refuse frames that are smaller than a band and its search range."""
-    needed = _needed_size(options)
-    if not fits_frame(num_rows, width, options):
+def check_frame_size(num_rows: int, width: int, options: RegistrationOptions, parts: int = 1) -> None:
+    """Refuse frames that are smaller than a band and its search range, or whose ``parts`` of the columns are."""
+    rows, columns = _needed_size(options)
+    if not fits_frame(num_rows, round(width / parts), options):
+        of_columns = f" in {parts} parts of the columns, for roll, zoom or a lens," if parts > 1 else ""
         raise ValueError(
             f"frames of {num_rows} x {width} px (rows in readout order x px per row) are too small for bands of "
-            f"{options.band_rows} rows searched over {options.search} px: at least {needed[0]} x {needed[1]} are "
-            "needed; reduce band_rows or search"
+            f"{options.band_rows} rows{of_columns} searched over {options.search} px: at least {rows} x "
+            f"{parts * columns} are needed; reduce band_rows or search"
         )
 
 

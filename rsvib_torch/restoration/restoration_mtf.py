@@ -10,6 +10,7 @@ from torch import Tensor
 
 from rsvib_torch.frames.entry_points import vibration_options
 from rsvib_torch.frames.prepare import prepare_frames
+from rsvib_torch.imaging.sensor_model import sharpened
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.detected_vibration import DetectedVibration
@@ -20,7 +21,7 @@ from rsvib_torch.numerics.fourier import waves
 from rsvib_torch.options import RestorationMtfOptions
 from rsvib_torch.restoration.frame_motion import FrameMotion, motion_of_frames
 from rsvib_torch.restoration.noise import estimate_noise
-from rsvib_torch.restoration.restore import restore_prepared
+from rsvib_torch.restoration.restore import check_optics, restore_prepared
 from rsvib_torch.restoration.verdict.trust import vibration_to_undo
 from rsvib_torch.results.presentation import AXIS_NAMES, Result
 from rsvib_torch.text import text_table
@@ -154,6 +155,11 @@ def restoration_mtf(
     """
     if options.method != "exact" or options.prior != "gaussian":
         raise ValueError("restoration_mtf requires a linear restoration: method='exact' with prior='gaussian'")
+    if options.mosaic is not None:
+        raise ValueError(
+            f"restoration_mtf takes grey or colour frames, got mosaic={options.mosaic!r}, whose colours have different "
+            "MTFs; take a plane of one colour"
+        )
     prepared = prepare_frames(
         frames,
         timing,
@@ -186,6 +192,7 @@ def restoration_mtf(
     )
     probed = replace(prepared, images=images, missing=missing, saturated=saturated)
     restored = restore_prepared(probed, vibration, options)[0, :, colours:]
+    restored = sharpened(restored, check_optics(options.optics), options.scale)
     gains = _gains(restored[:, :-1], frequency, points) / level
     if timing.scan_axis == -1:
         gains = gains.flip(0)

@@ -205,8 +205,8 @@ def restore_each(
     moving = axes.any(-1)
     if bool(moving.any()):
         moved = trusted.mapped(lambda values: values[moving]).to_row_order(timing).to(result.device)
-        every = MovingFrames.of(frames, frame_motion(moved, timing.in_row_order(), 1, height))
-        restored = _restored(every.mapped(lambda values: values.flatten(0, 1)[moving][:, None]), options)[:, 0]
+        apart = MovingFrames.of(frames, frame_motion(moved, timing.in_row_order(), 1, height))
+        restored = _restored(apart.mapped(lambda values: values.flatten(0, 1)[moving][:, None]), options)[:, 0]
         flat = result.flatten(0, 1)
         flat[moving] = sharpened(restored, check_optics(options.optics), options.scale)
         result = flat.unflatten(0, (stacks, count))

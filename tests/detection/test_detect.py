@@ -211,6 +211,7 @@ def detail(*shape, pixel=None):
         (torch.cat([detail(1, 256, 128), torch.zeros(1, 256, 128)]), {}, "frame 1 is constant"),
         (detail(2, 2, 1, 256, 128) * torch.tensor([1.0, 0.0])[:, None, None, None, None], {}, "frame 0 of stack 1 is"),
         (detail(2, 24, 128), {"method": "bands"}, "too small for bands of 32 rows searched over 16 px"),
+        (detail(2, 128, 128), {"roll": True}, "frames of 128 x 128 px .* in 2 parts .* at least 64 x 192 are needed"),
         *(
             (detail(2, *size), {}, rf"frames of {size[0]} x {size[1]} px .* at least 64 x 96 are needed")
             for size in ((24, 640), (64, 90), (40, 2048))

@@ -28,6 +28,12 @@ def check_dropped_frames(path):
     assert used == pytest.approx(TIMES, rel=1e-9)
 
 
+def test_pixels_of_a_finer_grid_are_smaller():
+    info = rsv.StackInfo((4, 8, 6), "uint8", 255.0, resolution=(300.0, 150.0, "inch"))
+    assert info.restored_as(2, None).resolution == (600.0, 300.0, "inch")
+    assert info.restored_as(1, "RGGB").resolution == info.resolution
+
+
 def check_no_times(path):
     assert timing_from_first_frame(TIMING, read_stack_info(path)) is TIMING
 

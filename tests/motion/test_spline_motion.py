@@ -23,6 +23,12 @@ def motion():
     return FreeMotion.through(TIMES, PATH)
 
 
+@pytest.mark.parametrize("clock", [1 - 1e-12, 1.0, 1 + 1e-12])
+def test_rounding_does_not_change_the_number_of_knots(clock):
+    found = FreeMotion.from_samples(TIMES * clock, PATH, spacing=1e-3 * clock)
+    assert found.coefficients.shape == motion().coefficients.shape
+
+
 def test_displacement_velocity_and_mean_are_those_of_a_natural_spline():
     times = np.random.default_rng(0).uniform(0.0, TIMES[-1], 200)
     given = torch.from_numpy(times)

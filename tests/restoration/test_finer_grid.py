@@ -179,6 +179,10 @@ def test_mtf_of_pixels_orientations_and_errors(frames):
     assert "noise gain" in str(curve)
     refuses(lambda: rsv.restoration_mtf(frames, TIMING, VIBRATION, prior="edges"), "requires a linear restoration")
     refuses(lambda: rsv.restoration_mtf(frames[None, :, None], TIMING, VIBRATION), "one stack of frames")
+    refuses(lambda: rsv.restoration_mtf(frames, TIMING, VIBRATION, mosaic="RGGB"), "mosaic='RGGB'")
+    sharper = rsv.restoration_mtf(frames[:2], TIMING, VIBRATION, joint=True, optics=rsv.Optics(sigma=0.9))
+    assert (sharper.mtf >= curve.mtf - 1e-3).all()
+    assert sharper.mtf.max() > 1.2  # the contrast before the optics
 
 
 def test_frames_that_sample_the_same_points_are_reported(scene, truth):

@@ -131,7 +131,8 @@ def prior_strengths(
     handicap = np.maximum(-0.014 * octaves, 0.002 * octaves)
     selected = np.full(len(images), _TRIED - 1)
     for tried in (_TRIED, len(_STRENGTHS)):
-        if (selected < _TRIED - 1).all():
+        open_scenes = selected == _TRIED - 1
+        if not open_scenes.any():
             break
         # ``n |r|^2 / (n - freedom)^2`` of Craven and Wahba (1979) estimates the squared error of predicting a pixel
         # from all others. The sum over the frequencies is dominated by those with the largest errors; the geometric
@@ -142,5 +143,5 @@ def prior_strengths(
             of_sum = np.log(power.sum(-1)) - 2 * np.log(rest.sum(-1))
             geometric = (np.log(power) - 2 * np.log(rest)).mean(-1)
         criteria = (np.where(allowed[:tried], values + handicap[:tried], np.inf) for values in (of_sum, geometric))
-        selected = np.maximum(*(criterion.argmin(0) for criterion in criteria))
+        selected = np.where(open_scenes, np.maximum(*(criterion.argmin(0) for criterion in criteria)), selected)
     return _STRENGTHS[selected]
