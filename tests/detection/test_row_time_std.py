@@ -50,7 +50,8 @@ def test_parameters_of_swept_tones_are_within_two_standard_deviations():
 
 
 def test_displacements_of_free_motions_are_within_two_standard_deviations():
-    path = torch.stack([1.5 * torch.sin(700 * TIMES), 1.1 * torch.sin(330 * TIMES + 1)], -1)
+    bent = TIMES.square()  # of sweeps: tones would take the place of the spline
+    path = torch.stack([1.5 * torch.sin(700 * TIMES + 900 * bent), 1.1 * torch.sin(330 * TIMES + 900 * bent)], -1)
     frames, motion = frames_of(path, 6), FreeMotion.through(TIMES, path)
     right, certain, found = (detect_motion(frames, wrong(*of)) for of in ((0.0, 0.0), (0.01, 0.0), (0.01, 0.01)))
     true = motion.displacement(found.times)

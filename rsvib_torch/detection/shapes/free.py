@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy import linalg, sparse
 from torch import Tensor
 from torch.nn import functional
@@ -31,7 +32,7 @@ from rsvib_torch.detection.rows.grouped_frames import (
 from rsvib_torch.detection.sensitivity import displacements_by_row_time
 from rsvib_torch.detection.start import BandStart, band_start
 from rsvib_torch.detection.strips import FieldScale, camera_in_row_order
-from rsvib_torch.detection.tones.fit import fitted_again, motion_of_fit, residual_of
+from rsvib_torch.detection.tones.fit import ToneFit, fit_tones, fitted_again, motion_of_fit, residual_of
 from rsvib_torch.detection.tones.selection import find_tones, with_best_aliases
 from rsvib_torch.detection.tones.uncertainty import with_further_tones
 from rsvib_torch.detection.verdict import rotation_reasons, scene_reasons
@@ -48,7 +49,7 @@ from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.numerics.splines import gauss_legendre, spline_taps
-from rsvib_torch.numerics.tables import Array, table, tensor
+from rsvib_torch.numerics.tables import Array, split_axis, table, tensor
 from rsvib_torch.options import FreeMotionOptions, RegistrationOptions
 from rsvib_torch.results.presentation import AXIS_NAMES, JudgedResult, axis_rows, verdict_table
 from rsvib_torch.results.reason import Reason
@@ -165,7 +166,7 @@ def detect_motion(frames: FramesOrFiles, timing: SensorTiming, options: FreeMoti
         >>> for images in (frames, restored):  # mean difference of two frames
         ...     print(f"{(images[1] - images[0])[16:-16, 16:-16].abs().mean():.3f}")
         0.040
-        0.001
+        0.000
         >>> found.reliable.tolist()
         [True, True]
     """
@@ -199,6 +200,7 @@ def _detect(stack: GreyFrames, timing: SensorTiming, options: FreeMotionOptions,
     rows_of_report = np.linspace(0, scale.height - 1, min(32, scale.height))
     times = starts[:, None] + tensor(rows_of_report) * rowwise.row_time + 0.5 * rowwise.exposure_time
     fit = _fit_spline(weighed, motion.spacing, record, table(times).ravel())
+    of_noise, by_row_time = _Spread.of(fit, measured, times), np.zeros_like(measured.displacements)
     if rowwise.row_time_std:
         by_row_time = displacements_by_row_time(measured, motion[0], rowwise, len(starts))
         changed = replace(weighed, displacements=weighed.displacements + by_row_time)
@@ -206,13 +208,16 @@ def _detect(stack: GreyFrames, timing: SensorTiming, options: FreeMotionOptions,
         changes = other.coefficients - fit.coefficients
         fit = replace(fit, covariances=[of + np.outer(c, c) for of, c in zip(fit.covariances, changes, strict=True)])
     motion = _motion(fit, (0.25 * scale.width, 0.25 * scale.height))  # px; beyond, frames share too little
-    # 3. The row bands, which may contradict the motion of the middle column.
+    # 3. The tones that explain the rows as well.
+    tones = _agreeing_tones(measured, motion[0], rowwise, of_noise.seen)
+    free, spread = tones.in_place(motion[0], _Spread.of(fit, measured, times), times, by_row_time)
+    # 4. The row bands, which may contradict the motion of the middle column.
     of_middle: Motion = motion
     if not scale.same_for_all_columns:
         middle = torch.zeros(1, dtype=torch.float64, device="cpu")
         of_middle = ColumnMotion.of_columns(scale.free_motion(motion), middle, rowwise, len(starts), scale.height)
     of_bands = bands_reasons(start, scale.width, of_middle[0], scale.axes)
-    report = _report(motion[0], fit, measured, timing, times, scale, of_bands, rows.differential()[0])
+    report = _report(free, spread, measured, timing, times, scale, of_bands, rows.differential()[0])
     return report.to(stack.images.device)
 
 
@@ -531,12 +536,129 @@ def _fit_with_spectrum(gram: Tensor, right: Tensor, noise: float, smoothness: fl
     return columns @ amplitude, columns @ covariance @ columns.mT
 
 
+# --- Uncertainty, and tones ---
+
+
+@dataclass(frozen=True, eq=False)
+class _Spread:
+    """Standard deviations in px of a motion, in row order."""
+
+    of_rows: Array  # (T, R, A) at the times of a report
+    seen: Array  # (A,) of the motion of scene rows between frames
+    unseen: Array  # (A,) of their mean over the frames
+
+    @classmethod
+    def of(cls, fit: _SplineFit, measured: Measurements, times: Tensor) -> "_Spread":
+        """That of a spline."""
+        index, weights = spline_taps(table(times).ravel(), fit.start, fit.spacing, fit.coefficients.shape[-1])
+        of_rows = np.sqrt(fit.variances(index, weights[:, None]))[:, 0]
+        return cls(split_axis(of_rows, 0, *times.shape), *_visible_and_common(fit, measured))
+
+
+def _visible_and_common(fit: _SplineFit, measured: Measurements) -> tuple[Array, Array]:
+    """(A,) px, rms standard deviations of displacements of scene rows less their mean over the frames, and of this."""
+    seen = measured.visible[0]
+    several = seen.sum(-1) > 1
+    seen, times = seen[several], measured.exposure_starts[0][several] + 0.5 * measured.exposure_time
+    first = np.where(seen > 0, times, np.inf).min(1, keepdims=True)
+    index, weights = spline_taps(np.where(seen > 0, times, first), fit.start, fit.spacing, fit.coefficients.shape[-1])
+    sums = np.zeros((2, len(fit.coefficients)))
+    for part in runs(len(seen), 256):  # (256, G, 4 G, 4 G) at a time
+        frames = seen[part].shape[1]
+        of_frames = (np.eye(frames)[:, :, None] * weights[part, None]).reshape(-1, frames, 4 * frames)  # (n, G, 4 G)
+        share = seen[part] / seen[part].sum(1, keepdims=True)
+        mean = (share[:, :, None] * of_frames).sum(1, keepdims=True)
+        indices = index[part].reshape(-1, 4 * frames)
+        of_visible = fit.variances(indices, of_frames - mean)
+        sums += np.stack([(of_visible * seen[part, :, None]).sum((0, 1)), fit.variances(indices, mean).sum((0, 1))])
+    return np.sqrt(sums[0] / seen.sum()), np.sqrt(sums[1] / len(seen))
+
+
+# rms difference of the displacements of rows by tones from those by a spline, over their standard deviation. Of 240
+# axes of random walks and smooth motions in five frames, tones were at least 2.0 apart, of 70 axes with the right tones
+# at most 1.1
+_MAX_APART = 1.3
+# frames beyond the number of tones of an axis that may take the place of a spline: three tones agreed with a random
+# walk in two frames and were wrong by 21 px, with a standard deviation of 0.1 px
+_FRAMES_BESIDE = 2
+
+
+@dataclass(frozen=True, eq=False)
+class _Tones:
+    """Tones of the rows of one stack."""
+
+    fit: ToneFit  # the fit to them
+    weighed: Measurements  # the rows with the weights of the fit
+    agree: NDArray[np.bool_]  # (A,) axes whose rows they explain as well as a spline
+
+    def in_place(
+        self, motion: FreeMotion, spread: _Spread, times: Tensor, by_row_time: Array
+    ) -> tuple[FreeMotion, _Spread]:
+        """The motion with tones in place of the spline, on axes that they explain as well.
+
+        The spline is kept where the tones are more uncertain than they differ from it, and where the frames are too
+        few, so that different tones agree; their difference then counts as its standard deviation. ``by_row_time`` (1,
+        N, G, A) px are the changes of the displacements by the standard deviation of the row time.
+        """
+        # 1. The standard deviation of the tones, with the allowance for a further one.
+        starts = table(times).ravel() - 0.5 * self.weighed.exposure_time
+        of_noise = with_further_tones(self.weighed, self.fit, starts)[1].displacement_std[0]
+        changed = replace(self.weighed, displacements=self.weighed.displacements + by_row_time)
+        shifted = fit_tones(changed, self.fit, self.fit.active)
+        change = table(motion_of_fit(shifted)[0].displacement(times) - motion_of_fit(self.fit)[0].displacement(times))
+        of_tones = np.hypot(of_noise, change - change.mean((0, 1)))
+        # 2. The axes on which they are better.
+        difference = table(self._replaced(motion, self.agree).displacement(times) - motion.displacement(times))
+        size, uncertain, of_spline = difference.std((0, 1)), _rms_of_rows(of_tones), _rms_of_rows(spread.of_rows)
+        taken = self.agree & ((uncertain < of_spline) | (2 * uncertain < size))
+        taken &= self.fit.active[0].sum(-1) <= len(times) - _FRAMES_BESIDE
+        # 3. The motion and its standard deviations.
+        of_rows = np.where(taken, of_tones, np.hypot(spread.of_rows, size))
+        unseen = np.where(taken, uncertain, np.hypot(spread.unseen, size))
+        return self._replaced(motion, taken), _Spread(of_rows, spread.seen, unseen)
+
+    def _replaced(self, motion: FreeMotion, axes: NDArray[np.bool_]) -> FreeMotion:
+        """The motion with tones and a straight line in place of the spline of some axes."""
+        tones = motion_of_fit(replace(self.fit, active=self.fit.active & axes[:, None]))[0]
+        knots, speed = motion.knots, motion.tones.image_motion
+        line = (tones.image_motion - speed)[:, None] * (knots - knots.mean())
+        coefficients = torch.where(torch.from_numpy(axes)[:, None], line, motion.coefficients)
+        return FreeMotion(coefficients, motion.start, motion.spacing, replace(tones, image_motion=speed))
+
+
+def _agreeing_tones(measured: Measurements, motion: FreeMotion, timing: RowTiming, of_noise: Array) -> _Tones:
+    """The tones of the rows of one stack, and whether they explain the rows of an axis as well as the motion.
+
+    The spline has a smooth power spectrum, in which a tone near a multiple of the frame rate, which the frames hardly
+    show, is nearly missing. A few tones that agree with the same rows are the simpler explanation, and determine also
+    what all frames have in common. ``of_noise`` (A,) px are the standard deviations of the motion of rows between
+    frames by noise.
+    """
+    residual = residual_of_motion(measured, motion)
+    interval = max(BLOCK_ROWS * timing.row_time, 0.5 * timing.exposure_time)
+    rows = replace(measured, independent=measured.independent_fraction(residual))
+    single = find_tones(rows, interval, 1)
+    for _ in range(2):  # the other side of a multiple of the frame rate, and then of another multiple
+        single = with_best_aliases(rows, single, 0.0, 1.0)
+    fit = find_tones(rows, interval, start=single, least_gain=0.02)
+    weighed = measured.weighed(residual_of(measured, fit))
+    fit = fitted_again(weighed, fit)
+    apart = (residual_of(measured, fit) - residual)[0][measured.visible[0] > 0]
+    agree = fit.active[0].any(-1) & (np.sqrt(np.square(apart).mean(0)) < _MAX_APART * of_noise)
+    return _Tones(fit, weighed, agree)
+
+
+def _rms_of_rows(values: Array) -> Array:
+    """(A,) root mean square of values (T, R, A)."""
+    return np.sqrt(np.square(values).mean((0, 1)))
+
+
 # --- Report ---
 
 
 def _report(
     motion: FreeMotion,
-    fit: _SplineFit,
+    spread: _Spread,
     measured: Measurements,
     timing: SensorTiming,
     times: Tensor,
@@ -549,20 +671,13 @@ def _report(
     ``of_bands`` are the reasons of each axis from the row bands, ``apart`` (2,) px the rms difference of the
     displacements along a row that the motion does not explain.
     """
-    # 1. Standard deviations of the spline, or of tones that explain the rows as well; and what neither contains: motion
-    # that is faster than the knots.
-    index, weights = spline_taps(table(times).ravel(), fit.start, fit.spacing, fit.coefficients.shape[-1])
-    std = tensor(np.sqrt(fit.variances(index, weights[:, None]))[:, 0]).unflatten(0, times.shape)
-    of_visible, of_common = _visible_and_common(fit, measured)
-    of_spline = table(std.square().mean((0, 1)).sqrt())
-    motion, has_tones, further = _with_tones(motion, measured, timing, times, of_spline, of_visible)
+    # 1. Standard deviations, with what neither spline nor tones contain: motion that is faster than the knots.
     value, residual = motion.displacement(times), residual_of_motion(measured, motion)
     value = value - value.mean((0, 1))
-    sudden = tensor(_sudden(measured, residual, table(times), fit.spacing))
-    std = torch.hypot(torch.hypot(torch.where(torch.from_numpy(has_tones), 0.0, std), tensor(further)), sudden)
-    std_seen = torch.hypot(tensor(of_visible), sudden.square().mean((0, 1)).sqrt())
-    unseen = tensor(np.hypot(np.where(has_tones, 0.0, of_common), further))
-    rest = tensor(measured.unexplained(residual)[0])
+    sudden = tensor(_sudden(measured, residual, table(times), motion.spacing))
+    std = torch.hypot(tensor(spread.of_rows), sudden)
+    std_seen = torch.hypot(tensor(spread.seen), sudden.square().mean((0, 1)).sqrt())
+    unseen, rest = tensor(spread.unseen), tensor(measured.unexplained(residual)[0])
     # 2. The verdict.
     moved = (value - value.mean(0)).square().mean((0, 1)).sqrt()
     findings = []
@@ -602,75 +717,3 @@ def _sudden(measured: Measurements, residual: Array, times: Array, spacing: floa
     local = (total[last] - total[first]) / np.maximum(last - first, 1)[..., None]
     usual = np.median(local, (0, 1))
     return np.sqrt(np.where(local > _SUDDEN * usual, local, 0.0))
-
-
-# rms difference of the displacements of rows by tones from those by a spline, over their standard deviation. Of 240
-# axes of random walks and smooth motions in five frames, tones were at least 2.0 apart, of 70 axes with the right tones
-# at most 1.1
-_MAX_APART = 1.3
-# frames beyond the number of tones of an axis that may take the place of a spline: three tones agreed with a random
-# walk in two frames and were wrong by 21 px, with a standard deviation of 0.1 px
-_FRAMES_BESIDE = 2
-
-
-def _with_tones(
-    motion: FreeMotion, measured: Measurements, timing: SensorTiming, times: Tensor, std: Array, of_visible: Array
-) -> tuple[FreeMotion, Array, Array]:
-    """The motion with tones in place of the spline, on axes whose rows these explain as well.
-
-    The spline has a smooth power spectrum, in which a tone near a multiple of the frame rate, which the frames hardly
-    show, is nearly missing. A few tones that agree with the same rows are the simpler explanation, and determine also
-    what all frames have in common. The spline is kept where they are more uncertain than they differ from it, and where
-    the frames are too few, so that different tones agree.
-
-    ``std`` (A,) px is the standard deviation of the spline in all rows, ``of_visible`` (A,) px that of the motion
-    between frames. The results are the motion, the axes (A,) with tones, and (A,) px the standard deviation of the
-    tones, or their difference from a spline that is kept; 0 without tones that agree.
-    """
-    # 1. The tones of the rows, and their standard deviation with the allowance for a further one.
-    residual = residual_of_motion(measured, motion)
-    interval = max(BLOCK_ROWS * timing.row_time, 0.5 * timing.exposure_time)
-    rows = replace(measured, independent=measured.independent_fraction(residual))
-    single = find_tones(rows, interval, 1)
-    for _ in range(2):  # the other side of a multiple of the frame rate, and then of another multiple
-        single = with_best_aliases(rows, single, 0.0, 1.0)
-    fit = find_tones(rows, interval, start=single, least_gain=0.02)
-    weighed = measured.weighed(residual_of(measured, fit))
-    fit = fitted_again(weighed, fit)
-    starts = table(times - 0.5 * timing.exposure_time).ravel()
-    of_tones = with_further_tones(weighed, fit, starts)[1].displacement_std[0]
-    # 2. The axes on which they agree with the spline, and the difference in all rows.
-    apart = (residual_of(measured, fit) - residual)[0][measured.visible[0] > 0]
-    number = fit.active[0].sum(-1)
-    agree = (number > 0) & (np.sqrt(np.square(apart).mean(0)) < _MAX_APART * of_visible)
-
-    def replaced(axes: Array) -> FreeMotion:
-        """The motion with tones and a straight line instead of the spline of some axes."""
-        tones, knots = motion_of_fit(replace(fit, active=fit.active & axes[:, None]))[0], motion.knots
-        speed = motion.tones.image_motion
-        line = (tones.image_motion - speed)[:, None] * (knots - knots.mean())
-        coefficients = torch.where(torch.from_numpy(axes)[:, None], line, motion.coefficients)
-        return FreeMotion(coefficients, motion.start, motion.spacing, replace(tones, image_motion=speed))
-
-    difference = table(replaced(agree).displacement(times) - motion.displacement(times)).std((0, 1))
-    taken = agree & ((of_tones < std) | (2 * of_tones < difference)) & (number <= len(times) - _FRAMES_BESIDE)
-    return replaced(taken), taken, np.where(taken, of_tones, difference)
-
-
-def _visible_and_common(fit: _SplineFit, measured: Measurements) -> tuple[Array, Array]:
-    """(A,) px, rms standard deviations of displacements of scene rows less their mean over the frames, and of this."""
-    seen = measured.visible[0]
-    several = seen.sum(-1) > 1
-    seen, times = seen[several], measured.exposure_starts[0][several] + 0.5 * measured.exposure_time
-    first = np.where(seen > 0, times, np.inf).min(1, keepdims=True)
-    index, weights = spline_taps(np.where(seen > 0, times, first), fit.start, fit.spacing, fit.coefficients.shape[-1])
-    sums = np.zeros((2, len(fit.coefficients)))
-    for part in runs(len(seen), 256):  # (256, G, 4 G, 4 G) at a time
-        frames = seen[part].shape[1]
-        of_frames = (np.eye(frames)[:, :, None] * weights[part, None]).reshape(-1, frames, 4 * frames)  # (n, G, 4 G)
-        share = seen[part] / seen[part].sum(1, keepdims=True)
-        mean = (share[:, :, None] * of_frames).sum(1, keepdims=True)
-        indices = index[part].reshape(-1, 4 * frames)
-        of_visible = fit.variances(indices, of_frames - mean)
-        sums += np.stack([(of_visible * seen[part, :, None]).sum((0, 1)), fit.variances(indices, mean).sum((0, 1))])
-    return np.sqrt(sums[0] / seen.sum()), np.sqrt(sums[1] / len(seen))
