@@ -110,7 +110,7 @@ class WindowTone:
 
     def waves(self, times: Array, averaged: Averaged) -> NDArray[np.complex128]:
         """Values at times, averaged over the exposure and the patch of a corner, of an amplitude of 1."""
-        frequency = self.frequency + self.slope * times
+        frequency = self.frequency + self.slope * times if self.slope else np.array(self.frequency)
         attenuation = np.prod([np.sinc(frequency * seconds) for seconds in averaged], 0)
         return np.asarray(attenuation * np.exp(1j * math.pi * (self.frequency + frequency) * times))
 
@@ -358,7 +358,7 @@ class _WindowFit:
         tone = WindowTone(axis, frequency, knots, self.start - self.origin, self.envelope_step, slope)
         other = copy(self)
         other.tones, other.weights = [*map(copy, self.tones), tone], self.layer.astype(np.float64)
-        other.solve()
+        other.solve(1)
         return other
 
     def of_layer(self) -> "_WindowFit":
