@@ -16,10 +16,10 @@ from scipy.optimize import least_squares
 
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.tones.fit import MIN_GAIN
+from rsvib_torch.detection.tones.selection import F_THRESHOLD
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.results.reason import Reason
 
-F_THRESHOLD = 14.0  # decrease of chi-square per parameter, as for tones of known timing (tones/selection.py)
 MAX_CHI_SQUARE = 30.0  # above that of the best row time, for another one that explains the frames as well
 MIN_SHARE = 0.2  # of the residual sum of squares that a further tone must explain
 

@@ -19,6 +19,7 @@ from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
 from rsvib_torch.detection.start import measurements_of_curve
 from rsvib_torch.detection.tones.fit import MIN_GAIN, offset_gain
+from rsvib_torch.detection.tones.selection import F_THRESHOLD
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.numerics.tables import Array, table, true_runs, valid_mean
 from rsvib_torch.options import MAX_TONES, RegistrationOptions
@@ -26,7 +27,6 @@ from rsvib_torch.registration import OffsetCurve
 
 _KNOT_FRAMES = 8  # frame periods between knots: a tone that decays to a third within them is straight to 5 % of it
 _STEPS = 3.0  # frequencies that are tried for each inverse distance of the knots
-_MIN_EXPLAINED = 14.0  # decrease of chi-square for each parameter of a tone: that of noise stays below
 # px, rms of the offsets by a tone: smaller ones may be errors of the registration, and of rows that are measured around
 # a motion that is known less well
 _MIN_SIZE, _MIN_SIZE_OF_ROWS = 0.02, 0.1
@@ -191,7 +191,7 @@ def sudden_change(curve: OffsetCurve, starts: Array, rows: RowTiming, bands: Reg
     (misfit, parameters), (of_whole, fewer) = found[best], fit(beside, slice(0, number))
     noise = misfit / max(beside.offsets[0].numel() - parameters, 1)
     added = max(parameters - fewer, 4 + 2 * number / _KNOT_FRAMES)
-    return best if of_whole - misfit > _MIN_EXPLAINED * noise * added else None
+    return best if of_whole - misfit > F_THRESHOLD * noise * added else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,7 +278,7 @@ class _AxisOffsets:
             size = 2 * len(self.record.knots)
             noise = max((float(data @ data) - most) / max(count - size * (len(found) + 1.5), 1), 1e-300)
             is_large = math.sqrt(most / max(self.weights.sum(), 1e-300)) > self.record.smallest
-            if not (is_large and most > _MIN_EXPLAINED * size * noise):
+            if not (is_large and most > F_THRESHOLD * size * noise):
                 break
             apart = np.abs(left - frequency) > 3 * step
             if self.is_blind(np.array(frequency)):

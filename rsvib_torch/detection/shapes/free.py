@@ -575,8 +575,8 @@ def _visible_and_common(fit: _SplineFit, measured: Measurements) -> tuple[Array,
 
 
 # rms difference of the displacements of rows by tones from those by a spline, over their standard deviation. Of 240
-# axes of random walks and smooth motions in five frames, tones were at least 2.0 apart, of 70 axes with the right tones
-# at most 1.1
+# axes of random walks and smooth motions in five frames, tones were at least 2.0 apart, of 160 axes with the right
+# tones at most 1.1
 _MAX_APART = 1.3
 # frames beyond the number of tones of an axis that may take the place of a spline: three tones agreed with a random
 # walk in two frames and were wrong by 21 px, with a standard deviation of 0.1 px

@@ -25,6 +25,7 @@ from rsvib_torch.detection.shapes.free import (
 )
 from rsvib_torch.detection.tones.fit import MIN_GAIN, offset_gain
 from rsvib_torch.detection.tones.periodogram import explained_power
+from rsvib_torch.detection.tones.selection import F_THRESHOLD
 from rsvib_torch.detection.verdict import MAX_DISPLACEMENT_STD
 from rsvib_torch.execution.parallel import threads_for
 from rsvib_torch.execution.precision import full_precision, without_gradients
@@ -49,7 +50,6 @@ _MAX_STD = 5.0  # standard deviations: fits nearer to the best one in chi-square
 _E_FOLDS = (-4.0, 0.0, 4.0, 10.0, 20.0)  # decays within the record that are tried
 _STARTS = 7.5  # starts over the squared number of periods of the highest frequency: sweeps, summed over frequencies
 _MAX_STARTS = 100_000  # the search takes 0.5 s for frames of 266 rows; a part of the record has fewer
-_F_THRESHOLD = 14.0  # decrease of chi-square per parameter: the maximum of noise over the grid of starts stays below
 # probability; of 96 axes of frames of noise, 54 were reliable without this limit and 0 of 60 with it
 _MAX_CHANCE = 0.01
 _TONE = ("amplitude", "frequency", "decay", "chirp", "phase")
@@ -228,7 +228,7 @@ def _detect(
     # 3. The last fit, its uncertainty, and what else the rows agree with.
     solved = [_settle(weighed, axis, record, starts[axis]) for axis in range(2)]
     fits, covariances, gains = (torch.stack([one[i][0] for one in solved]) for i in range(3))
-    fits = torch.where(gains[:, None] > _F_THRESHOLD, fits, _still(fits))
+    fits = torch.where(gains[:, None] > F_THRESHOLD, fits, _still(fits))
     motion = motion_of(fits)
     residual = residual_of_motion(measured, motion)
     independent = float((weighed.independent_fraction(residual) * measured.share_counted(residual))[0])

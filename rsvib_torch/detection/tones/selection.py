@@ -22,7 +22,7 @@ from rsvib_torch.options import MAX_TONES
 
 MIN_SIGNIFICANCE = 4.0  # amplitude over its standard deviation
 MIN_OFFSET = 0.01  # px, amplitude of the offsets of a tone; interpolation and unequal blur leave up to this
-_F_THRESHOLD = 14.0  # decrease of chi-square per parameter: the maximum of noise over a frequency grid stays below
+F_THRESHOLD = 14.0  # decrease of chi-square per parameter: the maximum of noise over a grid of starts stays below
 
 
 def robust_fit(
@@ -242,7 +242,7 @@ class _Search:
         first, second = weighted.square(before), weighted.square(after)
         parameters, families = 2 * self.model.harmonics + 1, self.with_one_more().sum(-1) // self.model.harmonics
         spare = self.measurements.num_measurements - parameters * families - 1
-        needed = np.maximum(_F_THRESHOLD * parameters * second / np.maximum(spare, 1.0), self.least_gain * first)
+        needed = np.maximum(F_THRESHOLD * parameters * second / np.maximum(spare, 1.0), self.least_gain * first)
         return first - second > share * needed
 
 
@@ -344,7 +344,7 @@ def significant_only(measurements: Measurements, fit: ToneFit, intervals: Array)
         after = measurements.square(residual_of(measurements, fit))
         before = measurements.square(residual_of(measurements, other))
         spare = measurements.num_measurements - 3 * fit.active.sum(-1)
-        worse = before - after > _F_THRESHOLD * 3 * harmonics * after / np.maximum(spare, 1.0)
+        worse = before - after > F_THRESHOLD * 3 * harmonics * after / np.maximum(spare, 1.0)
         keep = dropped & worse[..., None] & ~small
         needed = needed | keep
         if bool(keep.any()):
