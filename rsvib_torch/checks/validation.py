@@ -243,8 +243,9 @@ def _mistake(model: object, data: object, entry: ErrorDetails, path: str) -> _Mi
                 break  # the rest of the location names a member of a union
             path = f"{path}.{step}" if path else step
             if step not in value:
-                text = f"missing key; expected {expected_text(keys[step])}"
-                return _Mistake(path, TypeError(text), text)
+                expected_value = expected_text(keys[step])
+                required = TypeError(f"{path} is required; expected {expected_value}")
+                return _Mistake(path, required, f"missing key; expected {expected_value}")
             if kind in ("extra_forbidden", "unexpected_keyword_argument") and step not in keys:
                 unknown = TypeError(f"unknown option {quoted(path)}; the options are {', '.join(keys)}")
                 return _Mistake(path, unknown, f"unknown key; expected one of {', '.join(keys)}")

@@ -77,7 +77,10 @@ def detect_vibration(frames: FramesOrFiles, timing: SensorTiming, options: Vibra
     timing = stacks.timing
     height, width = stacks.images.shape[-2:]
     camera = camera_in_row_order(options, (height, width), timing)
-    field = FieldOptions(options.roll, options.zoom, camera)
+    zoom = False if options.roll is False and options.zoom == "auto" else options.zoom  # zoom is measured with roll
+    if options.roll is False and zoom:
+        raise ValueError("zoom=True measures roll as well, and roll=False excludes it; pass roll=True, or zoom=False")
+    field = FieldOptions(options.roll, zoom, camera)
     model = MotionModel(options.harmonics, 2 if options.image_acceleration else 1)
     chosen = DetectionOptions(options.method, None if options.tones == "auto" else options.tones, model, options)
     if options.columns is not None:

@@ -176,7 +176,10 @@ def _exposure_range(tones: _Tones, timing: RowTiming, ratio: float, std: float) 
         if stated < longest and max(map(abs, changes)) > 1.0:
             more = " and more" if longest < high else ""
             name = f"{AXIS_NAMES[axis]} {frequency:.4g} Hz"
-            of_tones.append(f"{name}: amplitude {changes[0]:+.2g} to {changes[1]:+.2g} %{more}")
+            # the phase is measured in the middle of the exposure, and stated for its start
+            turns = [math.pi * frequency * (stated - time) for time in (low, longest)]
+            amplitude, phase = ("{:+.2g} to {:+.2g}".format(*values) for values in (changes, turns))
+            of_tones.append(f"{name}: amplitude {amplitude} %, phase {phase} rad{more}")
     rows = f"{low / timing.row_time:.3g} to {high / timing.row_time:.3g}"
     effects = "; ".join(of_tones)
     return [f"exposure_rows={timing.exposure_rows:g}: the blur agrees with {rows}: {effects}"] if of_tones else []

@@ -20,6 +20,7 @@ from rsvib_torch.frames.mosaic import check_mosaic, colours_of, fill_by_colour, 
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.frames.pixels import fill_with_means
 from rsvib_torch.io.frame_times import timing_from_first_frame
+from rsvib_torch.io.full_scale import beyond_full_scale
 from rsvib_torch.io.stack_reading import FramesOrFiles, load_frames
 from rsvib_torch.motion.timing import RowTiming, SensorTiming, check_timing
 
@@ -209,7 +210,11 @@ def as_float_frames(
                 "full_scale=4095 for 12-bit counts (commands: --full-scale 4095)"
             )
         full_scale = 255.0
-    return frames.to(torch.float32) / check_number("full_scale", full_scale, above=0.0)
+    full_scale = check_number("full_scale", full_scale, above=0.0)
+    counts = frames.to(torch.float32)  # PyTorch finds no largest value of some integers
+    if counts.numel() and (largest := float(counts.max())) > full_scale:
+        raise ValueError(f"{name}: {beyond_full_scale(int(largest), full_scale)}")
+    return counts / full_scale
 
 
 def _missing_pixels(frames: Tensor, ignore: object, allow_missing: bool, axis: int) -> Tensor | None:

@@ -86,6 +86,11 @@ def frames_to_counts(frames: Tensor, dtype: np.dtype, full_scale: float | None, 
     # one pass; NaN and infinity are among the ends
     if pixels.numel() and not bool(torch.isfinite(torch.stack(pixels.aminmax())).all()):
         raise ValueError(f"frames contain NaN or infinite pixels, which {dtype} cannot represent; write floats")
+    if pixels.numel() and float((pixels > 2.0).float().mean()) > 0.5:  # of noisy, saturated frames, few are above 1.1
+        raise ValueError(
+            f"frames have values up to {float(pixels.max()):.4g}, and more than half of them are above 2: to be "
+            f"written as {dtype}, their full scale must be 1; divide them by it"
+        )
     narrow = dtype.itemsize <= 2 and pixels.dtype != torch.float64
     counts = pixels.to(torch.float32 if narrow else torch.float64) * full_scale
     return counts.round_().clamp_(0.0, float(np.floor(full_scale))).numpy().astype(dtype)

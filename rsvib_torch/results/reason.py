@@ -340,6 +340,18 @@ _SHAPES = {
         "the motion is determined to {value:.3g} px only, {limit:g} px are needed: frames may show different scenes",
         compares="rms standard deviation of the visible part of the motion, above 0.3 px",
     ),
+    "common_motion_uncertain": _px(
+        "the part of the motion that all frames have in common has a standard deviation of {value:.3g} px, more than "
+        "the motion of {limit:.3g} px",
+        "use more frames, or frames at other or unequal intervals; tones are measured by detect_vibration",
+        compares="rms standard deviation of the common part of the motion, above 0.3 px and the rms motion",
+    ),
+    "common_motion_large": _px(
+        "all frames have {value:.3g} px of the motion in common, more than {limit:.3g} px, ten times what differs "
+        "between them: a tone near a multiple of the frame rate, or a wrong frame_rows",
+        "check that frame_rows counts the blanking rows, or measure tones with detect_vibration",
+        compares="rms of the common part of the motion, above ten times that of the rest",
+    ),
     "too_few_frames_for_sweep": ReasonKind(
         "{value:g} frames do not determine decay and sweep of a tone, {limit:g} are needed: several swept tones fit",
         "use more frames, or a steady tone (detect_vibration)",
@@ -429,6 +441,12 @@ _ROW_TIME = {
         "pass row_time=(low, high) with limits around the right one, or use frames with vibrations of other, unrelated "
         "frequencies",
         "number of row times that explain the frames, above 1",
+    ),
+    "row_time_contradicted": _of_result(
+        "no row time within the limits agrees with the vibration: its frequencies per row and per frame contradict "
+        "each other (chi-square {value:.3g}, at most {limit:g} is expected)",
+        "check the frame rate, and pass wider limits row_time=(low, high)",
+        "chi-square of the frequencies of the tones at the row time, above 20",
     ),
     "too_few_frames_for_row_time": _of_result(
         "{value:g} frames determine the product of row time and frequency only, {limit:g} are needed",

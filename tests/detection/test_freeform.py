@@ -202,6 +202,14 @@ def test_tones_of_two_frames_widen_the_error_bars_only():
     assert (rms(found.std.numpy()) < 4.0).all()  # four times the motion says nothing
 
 
+def test_a_common_part_that_is_not_known_is_refused():
+    """Of fast tones in two frames, more than the motion is not determined."""
+    period = TIMING.frame_period
+    fast = Curve(lambda t: np.stack([1.5 * np.sin(14.5 * t / period), np.sin(11.6 * t / period + 1.0)], -1))
+    found = rsv.detect_motion(recorded((HEIGHT, 112), TIMING, fast, 2, 0.005, seed=12), TIMING)
+    assert [of_axis[0].code for of_axis in found.findings] == ["common_motion_uncertain"] * 2
+
+
 @pytest.mark.parametrize(("size", "seed"), [(128, 4), (256, 3)])
 def test_frames_of_independent_noise_have_no_motion(size, seed):
     """The spline explains the few rows that happen to agree, and there is no residual."""

@@ -86,7 +86,7 @@ def test_without_roll_the_result_is_the_same():
     scene = draw_scene(224, 224, 11, blur=1.2)
     frames = take_field_frames(scene, TIMING, FieldMotion((1.4, 1.9, 0.0, 0.0)), (160, 160), 2)
     frames = torch.from_numpy(frames + 0.004 * np.random.default_rng(5).standard_normal(frames.shape)).float()
-    found, without = detect_vibration(frames, TIMING), detect_vibration(frames, TIMING, roll=False, zoom=False)
+    found, without = detect_vibration(frames, TIMING), detect_vibration(frames, TIMING, roll=False)
     assert found.vibration.num_axes == 2
     assert torch.equal(found.vibration.amplitude, without.vibration.amplitude)
     assert torch.equal(found.std.frequency, without.std.frequency)
@@ -94,7 +94,8 @@ def test_without_roll_the_result_is_the_same():
 
 @pytest.mark.parametrize("function", [detect_vibration, detect_motion])
 def test_ignored_roll_is_named_as_the_reason(rolling, function):
-    found = function(rolling[1], TIMING, roll=False, zoom=False)
+    options = {} if function is detect_vibration else {"zoom": False}  # zoom="auto" is measured with roll only
+    found = function(rolling[1], TIMING, roll=False, **options)
     assert not bool(found.reliable[0])
     (apart,) = (reason for reason in found.findings[0] if reason.code == "halves_apart")
     assert apart.value > apart.limit
@@ -187,6 +188,7 @@ def test_focal_length_gives_the_attitude_of_a_camera_with_a_wide_field():
     ("options", "message"),
     [
         ({"columns": 64, "roll": True}, "columns=64 goes with roll=False"),
+        ({"roll": False, "zoom": True}, "zoom=True measures roll as well"),
         ({"principal_point": (1.0, 2.0)}, "principal_point=.* requires focal_length"),
         ({"distortion": (0.1, 0.0, 0.0, 0.0, 0.0)}, "distortion=.* requires focal_length"),
         ({"focal_length": 300.0, "distortion": (-3.0, 0.0, 0.0, 0.0, 0.0)}, "not invertible in frames of 96 x 128 px"),

@@ -210,6 +210,12 @@ def test_tensors_and_arrays_of_numbers():
     refuses(lambda: curve.at(torch.tensor([0.2, -0.1])), r"within 0 \.\.\. 1 cycles/px")
 
 
+def test_a_bar_is_no_edge():
+    bar = torch.linspace(-20, 20, 41).abs().expand(60, 41)
+    refuses(lambda: rsv.slanted_edge_mtf(bar), "no edge: both sides")
+    refuses(lambda: rsv.slanted_edge_mtf(draw_edge(5.0, 0.5) + draw_edge(5.0, 0.5)[:, ::-1]), "edge")
+
+
 def test_edge_that_a_vibration_has_torn_apart_is_refused():
     generator = torch.Generator().manual_seed(99)
     y, x = torch.meshgrid(torch.arange(24) - 12.0, torch.arange(20) - 10.0, indexing="ij")

@@ -103,7 +103,7 @@ HIDDEN = "(±): if another tone is hidden in the record"
 
 
 def test_a_detection_prints_in_eight_lines(detection, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "100")  # texts are wrapped at the width of the terminal
+    monkeypatch.setenv("COLUMNS", "140")  # texts are wrapped at the width of the terminal
     lines = str(detection).splitlines()
     assert repr(detection) == detection.summary() == str(detection)
     assert len(lines) == 8

@@ -58,6 +58,9 @@ from rsvib_torch.text import measured_text
 MAX_BAND_ERROR = 0.1  # px; smaller differences between the offsets of row bands and a motion are errors of registration
 _SECOND = (1.0, -2.0, 1.0)  # second difference
 _MAX_STD_SEEN = 0.3  # px, of the visible part of a reliable motion; frames of different scenes have more
+# rms of the part of a spline that all frames have in common over that of the rest. With frame_rows of the image height
+# instead of 300, a tone of 1.6 px became a motion of 25 px, whose visible part has 0.4 px
+_MOST_IN_COMMON = 10.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -687,6 +690,12 @@ def _report(
         against += rotation_reasons(axis, scale.axes, apart.tolist(), size)
         if float(std_seen[axis]) > _MAX_STD_SEEN:
             against.append(Reason("motion_uncertain", name, float(std_seen[axis]), _MAX_STD_SEEN))
+        limit = max(float(value[..., axis].square().mean().sqrt()), _MAX_STD_SEEN)  # of an axis that hardly moves
+        if float(unseen[axis]) > limit:
+            against.append(Reason("common_motion_uncertain", name, float(unseen[axis]), limit))
+        in_common, limit = float(value[..., axis].mean(0).square().mean().sqrt()), _MOST_IN_COMMON * float(moved[axis])
+        if not bool(motion.tones.moving_axes()[axis]) and in_common > limit:
+            against.append(Reason("common_motion_large", name, in_common, limit))
         findings.append(tuple(against))
     # 3. From row order and px to image axes and units.
     reliable, units = torch.tensor([not against for against in findings], device=rest.device), scale.units(value)

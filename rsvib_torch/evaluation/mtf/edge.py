@@ -101,6 +101,11 @@ class EdgeFit:
         return regressors @ self.sides.T, regressors
 
 
+# part of the range of the values of a region by which its sides differ at least; otherwise the start of the fit is not
+# finite
+_LEAST_STEP = 1e-3
+
+
 def straighten(roi: Tensor) -> Scatter:
     """Turn a ROI so that its edge is near-vertical and brightens to the right."""
     soft = torch.nn.functional.avg_pool2d(roi[None, None], 5, stride=1)[0, 0]
@@ -124,6 +129,8 @@ def _start_edge(scatter: Scatter) -> EdgeFit:
     image = scatter.value.view(-1, columns)
     few = max(2, columns // 12)
     low, high = image[:, :few].mean(), image[:, -few:].mean()
+    if float(high - low) < _LEAST_STEP * float(image.max() - image.min()):
+        raise ValueError("no edge: both sides of the roi are equally bright; choose a part with a single edge")
     dark = ((high - image) / (high - low)).mean(1) * columns  # columns of each row
     basis = scatter.basis(scatter.y.view(-1, columns)[:, 0])[0][:, :2]
     line = torch.linalg.lstsq(basis, (dark - 0.5 * columns)[:, None]).solution[:, 0]
