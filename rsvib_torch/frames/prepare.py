@@ -25,6 +25,7 @@ from rsvib_torch.io.stack_reading import FramesOrFiles, load_frames
 from rsvib_torch.motion.timing import RowTiming, SensorTiming, check_timing
 
 Saturation = float | Literal["auto"] | None
+_MOST_COUNTS = 1.1  # of full scale; the noise of simulated frames may exceed it by less
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,7 +213,7 @@ def as_float_frames(
         full_scale = 255.0
     full_scale = check_number("full_scale", full_scale, above=0.0)
     counts = frames.to(torch.float32)  # PyTorch finds no largest value of some integers
-    if counts.numel() and (largest := float(counts.max())) > full_scale:
+    if counts.numel() and (largest := float(counts.max())) > _MOST_COUNTS * full_scale:
         raise ValueError(f"{name}: {beyond_full_scale(int(largest), full_scale)}")
     return counts / full_scale
 

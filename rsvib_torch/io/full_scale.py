@@ -7,6 +7,8 @@ from torch import Tensor
 from rsvib_torch.checks.values import check_number
 from rsvib_torch.numerics.tables import Array
 
+_NOT_RELATIVE = 10.0  # of full scale 1; pixels beyond are counts or percents
+
 
 def check_dtype(dtype: np.dtype) -> None:
     """Raise a ``ValueError`` unless pixels of ``dtype`` are integers or floats of a supported size."""
@@ -86,10 +88,10 @@ def frames_to_counts(frames: Tensor, dtype: np.dtype, full_scale: float | None, 
     # one pass; NaN and infinity are among the ends
     if pixels.numel() and not bool(torch.isfinite(torch.stack(pixels.aminmax())).all()):
         raise ValueError(f"frames contain NaN or infinite pixels, which {dtype} cannot represent; write floats")
-    if pixels.numel() and float((pixels > 2.0).float().mean()) > 0.5:  # of noisy, saturated frames, few are above 1.1
+    if pixels.numel() and float((pixels > _NOT_RELATIVE).float().mean()) > 0.5:
         raise ValueError(
-            f"frames have values up to {float(pixels.max()):.4g}, and more than half of them are above 2: to be "
-            f"written as {dtype}, their full scale must be 1; divide them by it"
+            f"frames have values up to {float(pixels.max()):.4g}, and more than half of them are above "
+            f"{_NOT_RELATIVE:g}: to be written as {dtype}, their full scale must be 1; divide them by it"
         )
     narrow = dtype.itemsize <= 2 and pixels.dtype != torch.float64
     counts = pixels.to(torch.float32 if narrow else torch.float64) * full_scale
