@@ -1,5 +1,7 @@
 """Conversion between pixels as stored and float frames whose full scale is 1."""
 
+import math
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -86,11 +88,12 @@ def frames_to_counts(frames: Tensor, dtype: np.dtype, full_scale: float | None, 
         return pixels.to(torch.float64 if dtype.itemsize == 8 else torch.float32).numpy().astype(dtype, copy=False)
     full_scale = required_full_scale(full_scale, dtype, "frames")
     # one pass; NaN and infinity are among the ends
-    if pixels.numel() and not bool(torch.isfinite(torch.stack(pixels.aminmax())).all()):
+    lowest, highest = (float(end) for end in pixels.aminmax()) if pixels.numel() else (0.0, 0.0)
+    if not math.isfinite(lowest) or not math.isfinite(highest):
         raise ValueError(f"frames contain NaN or infinite pixels, which {dtype} cannot represent; write floats")
-    if pixels.numel() and float((pixels > _NOT_RELATIVE).float().mean()) > 0.5:
+    if highest > _NOT_RELATIVE and float((pixels > _NOT_RELATIVE).float().mean()) > 0.5:
         raise ValueError(
-            f"frames have values up to {float(pixels.max()):.4g}, and more than half of them are above "
+            f"frames have values up to {highest:.4g}, and more than half of them are above "
             f"{_NOT_RELATIVE:g}: to be written as {dtype}, their full scale must be 1; divide them by it"
         )
     narrow = dtype.itemsize <= 2 and pixels.dtype != torch.float64

@@ -203,17 +203,19 @@ def _detect(stack: GreyFrames, timing: SensorTiming, options: FreeMotionOptions,
     rows_of_report = np.linspace(0, scale.height - 1, min(32, scale.height))
     times = starts[:, None] + tensor(rows_of_report) * rowwise.row_time + 0.5 * rowwise.exposure_time
     fit = _fit_spline(weighed, motion.spacing, record, table(times).ravel())
-    of_noise, by_row_time = _Spread.of(fit, measured, times), np.zeros_like(measured.displacements)
+    spread = of_noise = _Spread.of(fit, measured, times)
+    by_row_time = np.zeros_like(measured.displacements)
     if rowwise.row_time_std:
         by_row_time = displacements_by_row_time(measured, motion[0], rowwise, len(starts))
         changed = replace(weighed, displacements=weighed.displacements + by_row_time)
         other = _fit_spline(changed, motion.spacing, record, table(times).ravel())
         changes = other.coefficients - fit.coefficients
         fit = replace(fit, covariances=[of + np.outer(c, c) for of, c in zip(fit.covariances, changes, strict=True)])
+        spread = _Spread.of(fit, measured, times)
     motion = _motion(fit, (0.25 * scale.width, 0.25 * scale.height))  # px; beyond, frames share too little
     # 3. The tones that explain the rows as well.
     tones = _agreeing_tones(measured, motion[0], rowwise, of_noise.seen)
-    free, spread = tones.in_place(motion[0], _Spread.of(fit, measured, times), times, by_row_time)
+    free, spread = tones.in_place(motion[0], spread, times, by_row_time)
     # 4. The row bands, which may contradict the motion of the middle column.
     of_middle: Motion = motion
     if not scale.same_for_all_columns:
@@ -603,6 +605,8 @@ class _Tones:
         few, so that different tones agree; their difference then counts as its standard deviation. ``by_row_time`` (1,
         N, G, A) px are the changes of the displacements by the standard deviation of the row time.
         """
+        if not self.agree.any():
+            return motion, spread
         # 1. The standard deviation of the tones, with the allowance for a further one.
         starts = table(times).ravel() - 0.5 * self.weighed.exposure_time
         of_noise = with_further_tones(self.weighed, self.fit, starts)[1].displacement_std[0]
@@ -642,7 +646,7 @@ def _agreeing_tones(measured: Measurements, motion: FreeMotion, timing: RowTimin
     rows = replace(measured, independent=measured.independent_fraction(residual))
     single = find_tones(rows, interval, 1)
     for _ in range(2):  # the other side of a multiple of the frame rate, and then of another multiple
-        single = with_best_aliases(rows, single, 0.0, 1.0)
+        single = with_best_aliases(rows, single, wrong_size=0.0, most_left=1.0)
     fit = find_tones(rows, interval, start=single, least_gain=0.02)
     weighed = measured.weighed(residual_of(measured, fit))
     fit = fitted_again(weighed, fit)

@@ -82,7 +82,7 @@ def with_best_aliases(
             (signs * fit.frequencies[index, axis] + steps / measurements.interval[index, None]).ravel()
         )
         others, residual = fit_roughly(some, frequencies, fit.active[tried], fit.model)
-        # 2. The best one, where it leaves half of the residual.
+        # 2. The best one, where it leaves little enough of the residual.
         sizes = without_nan(median(some.sizes(residual), 1), np.inf)[:, axis].reshape(len(index), -1)
         place, better = np.arange(len(size)), sizes.min(1) < most_left * size[index, axis]
         best = len(size) + np.arange(len(index)) * len(steps) + sizes.argmin(1)
