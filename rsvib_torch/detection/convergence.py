@@ -17,8 +17,6 @@ from rsvib_torch.detection.tones.selection import robust_fit
 from rsvib_torch.numerics.tables import Array, split_axis
 
 _KEPT = 4  # steps that are combined; more change results of long exposures by less than their standard deviations
-# A step was inexact if the next round corrects more than this part of it. Without long exposures, 0.1 is corrected
-_INEXACT = 0.3
 _MAX_EXTRAPOLATION = 4.0  # steps
 
 
@@ -34,11 +32,6 @@ class Step:
         """Step from the motion that the frames were warped by to the fitted motion."""
         before, after = (model_displacements(measurements, fit) for fit in (warped_by, fitted))
         return cls(after, after - before)
-
-    def is_inexact_after(self, previous: "Step") -> Array:
-        """(B,) bool, whether the previous step was too short or too long by more than 30 %: this one corrects it."""
-        product = (self.change * previous.change).sum((1, 2, 3))
-        return np.abs(product / np.maximum(np.square(previous.change).sum((1, 2, 3)), 1e-30)) > _INEXACT
 
 
 def is_converged(previous: ToneFit, fit: ToneFit, ratio: Array | None) -> Array:
@@ -86,25 +79,22 @@ class Acceleration:
         self.steps = [*self.steps[1 - _KEPT :], step] if same_tones else [step]
 
     def applied(self, measurements: Measurements, fit: ToneFit) -> ToneFit | None:
-        """The fit to the corrected measurements of the last step; None if the last two steps need no correction."""
+        """The fit to the corrected measurements of the last step; None before the second step."""
         if len(self.steps) < 2:
             return None
-        where = self.steps[-1].is_inexact_after(self.steps[-2])
-        if not bool(where.any()):
-            return None
-        corrected = replace(measurements, displacements=measurements.displacements - self._correction(where))
+        corrected = replace(measurements, displacements=measurements.displacements - self._correction())
         residual = residual_of(corrected, fit)
         return robust_fit(corrected, fit.frequencies, fit.active, fit.model, residual, steps=1)[0]
 
-    def _correction(self, where: Array) -> Array:
-        """Displacements (B, N, G, A) in px to subtract, 0 in the stacks that ``where`` (B,) does not contain."""
+    def _correction(self) -> Array:
+        """Displacements (B, N, G, A) in px to subtract."""
         pairs = list(itertools.pairwise(self.steps))
         fitted = np.stack([after.fitted - before.fitted for before, after in pairs], -1)
         # the combination of differences of changes that is nearest to the last change, (B, n, M) for M differences
-        changes = [(after.change - before.change).reshape(len(where), -1) for before, after in pairs]
+        changes = [(after.change - before.change).reshape(len(fitted), -1) for before, after in pairs]
         change = np.stack(changes, -1)
-        gram, right = change.mT @ change, change.mT @ self.steps[-1].change.reshape(len(where), -1, 1)
+        gram, right = change.mT @ change, change.mT @ self.steps[-1].change.reshape(len(fitted), -1, 1)
         ridge = 1e-3 * np.maximum(gram.diagonal(axis1=-2, axis2=-1).mean(-1), 1e-30)
         share = np.linalg.solve(gram + ridge[:, None, None] * np.eye(len(pairs)), right)[..., 0]
-        share = np.clip(share, -_MAX_EXTRAPOLATION, _MAX_EXTRAPOLATION) * where[:, None]
+        share = np.clip(share, -_MAX_EXTRAPOLATION, _MAX_EXTRAPOLATION)
         return (fitted * share[:, None, None, None]).sum(-1)
