@@ -251,10 +251,11 @@ def fit_directly(
         explained = np.flatnonzero(again.other_motion.explained)
         if len(explained):
             refined = with_better(refined, take_stacks([again], explained), index[explained])
-    # Roll and zoom that were confirmed are fitted again in pairs, if the exposures blur the frames differently.
-    if doubtful and not scale.same_for_all_columns and not bool(refined.abandoned.all()):
+    # Roll and zoom that were confirmed are fitted again in pairs, if the exposures blur the frames differently, and in
+    # narrower strips, if the start did not show them: roll of 2 mrad in 256 columns had a bias of 0.4 %.
+    if not scale.same_for_all_columns and not bool(refined.abandoned.all()):
         motion = motion_of_fit(shrunk(refined.fit, intervals), stacks.images.device)
-        if frames.differently_blurred(motion).any():
+        if not frames.suits(motion) or (doubtful and frames.differently_blurred(motion).any()):
             frames = grouped_strips(stacks.images, stacks.valid, timing, motion, scale)
             again = refine(frames, intervals, refined.fit, options.tones, has_pattern=hypothesis.has_pattern)
             refined = replace(again, abandoned=refined.abandoned)

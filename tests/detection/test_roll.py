@@ -73,6 +73,17 @@ def test_roll_that_displaces_rows_by_pixels():
     assert abs(float(found.vibration.amplitude[2, 0]) / 0.02 - 1) < 0.01
 
 
+def test_roll_that_the_start_shows_too_small_is_measured_in_narrow_strips():
+    """In four strips of 170 px, as for a small roll, the amplitude was 0.16 % too small, with more tones along y."""
+    truth = FieldMotion((3.0, 5.0, 8e-3, 0.0), (90.0, 61.0, 70.0, 0.0), (0.3, 1.1, 2.0, 0.0))
+    timing = SensorTiming(row_time=1.5375e-4, exposure_rows=1.3, frame_rows=166.5)
+    frames = take_field_frames(draw_scene(224, 576, 3, blur=1.2), timing, truth, (160, 512), 4)
+    frames = frames + 2e-4 * np.random.default_rng(5).standard_normal(frames.shape)
+    found = detect_vibration(torch.from_numpy(frames).float(), timing, roll=True, zoom=False)
+    assert found.reliable.tolist() == [True, True, True]
+    assert abs(float(found.vibration.amplitude[2, 0]) / 8e-3 - 1) < 5e-4
+
+
 def test_roll_is_measured_by_default(rolling, detection):
     """Zoom is measured as well, found to be 0, and left out."""
     found = detect_vibration(rolling[1], TIMING)

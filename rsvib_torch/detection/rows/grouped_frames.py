@@ -139,6 +139,10 @@ class GroupedFrames:
             pattern = pattern.new_zeros(rows, pattern.shape[-1]).index_copy_(0, self.rows_of(stacks), pattern)
         return replace(self, groups=[replace(group, spectra=group.spectra.without(pattern)) for group in self.groups])
 
+    def suits(self, motion: Vibration) -> bool:
+        """Whether a motion changes little within the width of what is measured."""
+        return True
+
     def blur_ratio(self, motion: Vibration) -> Tensor:
         """(B, 3) ratio, standard deviation and size as in ``displacements.blur_ratio``."""
         return blur_ratio(self.groups, self.timing, self.view(motion))
@@ -175,6 +179,12 @@ _MAX_SLIDE, _MIN_PITCH = 0.1, 48
 def _in_rad(motion: Vibration | FreeMotion, scale: FieldScale) -> Vibration | FreeMotion:
     """The motion with roll in rad and relative zoom."""
     return scale.free_motion(motion) if isinstance(motion, FreeMotion) else scale.motion(motion)
+
+
+def _slope(field: Vibration | FreeMotion, scale: FieldScale, starts: Tensor) -> float:
+    """Bound in px on the change of the displacement per column, by a motion between the first and the last start."""
+    reached = field.largest_displacement(float(starts.amin()), float(starts.amax()))
+    return float(largest_slope(reached, scale.width, scale.height, scale.camera).amax())
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,6 +231,13 @@ class GroupedStrips(GroupedFrames):
         field = _in_rad(motion, self.scale)
         return ColumnMotion.of_columns(field, self.columns, self.timing, self.num_frames, self.scale.height)
 
+    def suits(self, motion: Vibration) -> bool:
+        """Whether strips that are not much narrower would be chosen for a motion in px."""
+        starts = self.timing.row_starts(self.num_frames, self.scale.height)
+        pitch = float(self.columns[1] - self.columns[0])
+        slope = _slope(_in_rad(motion, self.scale), self.scale, starts)
+        return pitch <= 1.5 * max(_MIN_PITCH, _MAX_SLIDE / max(slope, 1e-9))
+
     def blur_ratio(self, motion: Vibration) -> Tensor:
         """(B, 3), the weighted mean over every second strip: they contain all columns.
 
@@ -256,8 +273,7 @@ def grouped_strips(
     times = starts.expand(*of_ends.batch_shape, -1)
     along = of_ends.mean_displacement(times, timing.exposure_time)[..., 0] - of_ends.drift(times)[..., 0]
     margin = math.ceil(float(along.abs().amax()) + 1.0) + MARGIN  # 1 px: whole pixels of an image motion
-    reached = field.largest_displacement(float(starts[0]), float(starts[-1]))
-    slope = float(largest_slope(reached, scale.width, scale.height, scale.camera).amax())
+    slope = _slope(field, scale, starts)
     strips = ColumnStrips.between_ends(scale.width, max(_MIN_PITCH, _MAX_SLIDE / max(slope, 1e-9)), margin)
     spectra = stack_spectra(frames, valid, strips)
     columns = strips.columns.to(frames.device)
