@@ -51,8 +51,8 @@ _BLUR_BIAS = 0.15
 _SAME_ALIAS = 0.01  # periods per frame; tones are separated from 0.02 on in a window of 96 frames
 _MAX_APART = 0.25  # of a tone, left in a third of the rows: tones of cameras have up to 0.14, in clips at night
 # Of the usual change from frame to frame: at least 0.18 in 36 clips that a hand holds, and at most 0.12 of copies in a
-# video of 24 frames per second that is stored as 30
-_COPY, _MEMORY = 0.15, 8
+# video of 24 frames per second that is stored as 30. More frames in a row are no copies: a pan has ended, or it is dark
+_COPY, _MEMORY, _MOST_IN_A_ROW = 0.15, 8, 3
 # Of the contrast of two frames of 16 x 16 px, their mean difference: at least 0.9 at 14 cuts, at most 0.7 in 13 clips.
 # Light that flickers more leaves many corners; those of unrelated frames that agree by chance are few
 _CUT, _THUMBNAIL, _FEW = 0.8, (16, 16), 64
@@ -376,7 +376,7 @@ class _FirstPass:
 
     def __init__(self, video: VideoPasses, times: Array) -> None:
         """A pass through a video, the middles of whose frames are at ``times`` (N,) in s."""
-        self._video, self._timing = video, video.frames.job.timing
+        self._video, self._timing, self._times = video, video.frames.job.timing, times
         self.taken = times.copy()  # of copies, when the frame before was taken
         self.faults: dict[int, str] = {}  # number of each frame that cannot be used, with the reason
         self.corners: dict[int, Corners] = {}  # between a frame and the next one, of the first frames of each part
@@ -385,6 +385,7 @@ class _FirstPass:
         self._others: set[int] = set()  # frames that show something else than the frame before
         self._before: tuple[int, NDArray[np.uint8]] | None = None  # the usable frame before, and its number
         self._changes: deque[float] = deque(maxlen=_MEMORY)  # counts, of the frames before
+        self._waiting: list[tuple[int, NDArray[np.uint8], float]] = []  # possible copies of it, and their changes
         self._follower = CornerFollower(self._timing)
 
     @property
@@ -405,21 +406,29 @@ class _FirstPass:
                 yield self._next(index, frame)
 
     def _next(self, index: int, frame: Frame | str) -> tuple[Corners | None, ...]:
-        """The corners between a frame and the usable frame before, if it is usable and there is one."""
-        # 1. Faults and copies.
+        """The corners between usable frames that are known with a frame."""
         if isinstance(frame, str):
             self.faults[index] = frame
             return ()
         grey, before = self._video.frames.grey(frame), self._before
         changed = math.inf if before is None else cv2.norm(grey, before[1], cv2.NORM_L1) / grey.size
         usual = float(np.median(self._changes)) if len(self._changes) >= _MEMORY // 2 else 0.0
-        if before is not None and changed <= _COPY * usual:
-            self.taken[index] = self.taken[before[0]]
+        if before is None or changed > _COPY * usual:
+            self._waiting.clear()
+            return self._used(index, grey, changed)
+        self.taken[index] = self.taken[before[0]]
+        self._waiting.append((index, grey, changed))
+        if len(self._waiting) <= _MOST_IN_A_ROW:
             return ()
+        waiting, self._waiting = self._waiting, []
+        return tuple(corners for one in waiting for corners in self._used(*one))
+
+    def _used(self, index: int, grey: NDArray[np.uint8], changed: float) -> tuple[Corners | None, ...]:
+        """The corners between a frame that is no copy and the usable frame before, if there is one."""
+        self.taken[index], before = self._times[index], self._before
         if grey.min() == grey.max():
             self.faults[index] = f"frame {index} is constant"
             return ()
-        # 2. Corners.
         corners = self._follower.next(grey, self._video.starts[index])
         self._before = index, grey
         if before is None:

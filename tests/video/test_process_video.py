@@ -263,6 +263,17 @@ def test_copies_of_frames_are_moved_along_the_smooth_path(tmp_path):
     assert np.abs(np.diff(steady)).max() < 0.3  # 0.8 with copies of restored frames
 
 
+def test_dark_frames_behind_bright_ones_are_no_copies(tmp_path):
+    """They change by a tenth of what the bright ones changed by: all of them counted as copies of the first one."""
+    bright = counts_of(Shaken())
+    dim = np.linspace(1.0, 0.1, 5).repeat((12, 1, 1, 1, len(bright) - 15))[:, None, None]
+    source = write(tmp_path / "clip.mp4", (bright * dim[..., None]).round().astype(np.uint8), options={"crf": "8"})
+    process_video(source, tmp_path / "steady.mp4", TIMING, border="crop", steady=1 / 3, **OPTIONS)
+    raw, steady = (shifts(pixels(path).mean(1) / dim)[17:-4, 0] for path in (source, tmp_path / "steady.mp4"))
+    assert np.abs(np.diff(raw)).max() > 2
+    assert np.abs(np.diff(steady)).max() < 1  # px, of compression; 4.6 as copies
+
+
 def test_every_shot_has_its_own_smooth_path(tmp_path):
     first, second = counts_of(Shaken())[:20], counts_of(Shaken(pan=-12.0), scene=SCENE[:, ::-1])[20:]
     steps = []
