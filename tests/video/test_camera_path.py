@@ -116,6 +116,20 @@ def test_a_subject_on_two_fifths_of_the_frame_is_not_followed():
     assert np.abs(np.diff(true, axis=0)[:, :2]).max() > 2.0
 
 
+def test_a_subject_on_two_thirds_of_the_frame_of_a_still_camera_is_not_followed():
+    rng, left, right = np.random.default_rng(4), WIDTH // 6, 5 * WIDTH // 6
+    scene, subject = (255 * draw_scene(HEIGHT + 40, WIDTH + 40, seed) for seed in (3, 7))
+    frames = []
+    for number in range(COUNT):
+        x, y = np.round(20 + 12 * np.sin(2 * np.pi * np.array([3.1, 5.3]) * number / RATE)).astype(int)
+        frame = scene[:HEIGHT, :WIDTH] + rng.normal(size=(HEIGHT, WIDTH))
+        frame[:, left:right] = subject[y : y + HEIGHT, left + x : right + x]
+        frames.append(np.clip(np.round(frame), 0, 255).astype(np.uint8))
+    path = fitted(np.stack(frames))[1]
+    assert np.abs(path.places(np.arange(COUNT) / RATE)[:, :2]).max() < 0.1  # px; the subject moves by 12 px
+    assert path.tones(0.5) == []
+
+
 def test_a_lamp_that_flickers_is_no_vibration():
     """Rows have up to twice the light of the same rows before: the frames were refused as different scenes."""
     frames = recorded({}, subject=False)
