@@ -54,6 +54,9 @@ _MIN_SINC = 0.1  # of the amplitude that remains in the mean over the exposure
 # 1 to 2 %, and 2 to 15 % too small without
 _PATCH_ROWS = 10
 _ALIASES = 2  # frequencies on each side of a tone that are compared with it
+# of what the best of them leaves, that the next one leaves at least: 1.12 and more of 24 right tones; 1.00 to 1.07 of
+# tones by noise, bars and texts beside the picture, and where a quarter of the rows has corners
+_DISTINCT = 1.08
 # turns, by which the phase of a tone drifts over a window without noise: frequencies of 48 tones in H.264 were wrong by
 # 0.003 to 0.005 Hz, 2 to 4 standard deviations of noise
 _DRIFT = 0.012
@@ -405,11 +408,15 @@ class _WindowFit:
 
         self.tones = [tone for tone, wave in zip(self.tones, waves, strict=True) if is_kept(tone, wave)]
 
-    def is_apart(self, axis: int, frequencies: Array) -> NDArray[np.bool_]:
-        """Whether frequencies are those of none of the tones of an axis, nor of a change of their amplitudes."""
+    def is_apart_from(self, frequency: float, others: Array) -> NDArray[np.bool_]:
+        """Whether other frequencies are not those of a tone, nor of a change of its amplitude."""
         resolved = max(2.0 / (self.times.max() - self.times.min()), 0.5 / self.envelope_step)
-        others = [tone.frequency for tone in self.tones if tone.axis == axis]
-        return np.all([np.abs(frequencies - other) > resolved for other in others] or [frequencies > 0], axis=0)
+        return np.asarray(np.abs(others - frequency) > resolved)
+
+    def is_apart(self, axis: int, frequencies: Array) -> NDArray[np.bool_]:
+        """Whether frequencies are those of none of the tones of an axis."""
+        tones = (tone for tone in self.tones if tone.axis == axis)
+        return np.all([frequencies > 0, *(self.is_apart_from(tone.frequency, frequencies) for tone in tones)], axis=0)
 
     def strongest(
         self, axis: int, slope: float, frequencies: Array, wanted: NDArray[np.bool_]
@@ -514,9 +521,12 @@ def fit_window(
         aliases = frequency + np.arange(-_ALIASES, _ALIASES + 1) / interval
         inside = (aliases > frequencies[is_visible][0]) & (aliases < frequencies[is_visible][-1])
         trials = [fit.with_tone(axis, float(alias), slope) for alias in aliases[inside & fit.is_apart(axis, aliases)]]
-        best = min(trials, key=lambda trial: trial.unexplained)
-        best.solve()
+        best, *others = sorted(trials, key=lambda trial: trial.unexplained)
         found = {of: value for of, value in found.items() if of[0] != axis}
+        if others and others[0].unexplained < _DISTINCT * best.unexplained:
+            left_out[axis] |= np.any([~fit.is_apart_from(alias, frequencies) for alias in aliases], axis=0)
+            continue
+        best.solve()
         if best.has_blind_tone():
             # A part of the picture that moves by itself displaces the same rows again and again: without vibration, it
             # became tones of up to 70 px at the frame rate.
