@@ -16,7 +16,7 @@ from rsvib_torch.detection.shapes.free import normal_bands
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.numerics.splines import spline_taps
 from rsvib_torch.numerics.tables import Array
-from rsvib_torch.row_time.row_tones import MAX_CHI_SQUARE, Candidate, FramePlaces, RowTimeFit
+from rsvib_torch.row_time.by_tones import MAX_CHI_SQUARE, Candidate, FramePlaces, RowTimeFit, refined
 
 DEGREE = 7  # a simulated motion of 8 Hz bandwidth needs knots of 11 ms to its noise, and of 8 ms with degree 3
 _GRID_FRAMES = 24  # frames whose minima over the grid of row times are refined with all frames
@@ -109,12 +109,4 @@ def _evaluated(places: FramePlaces, row_time: float, spacing: float) -> tuple[Ca
 
 
 def _refined(places: FramePlaces, row_time: float, spacing: float, low: float, high: float) -> Candidate:
-    """Gauss-Newton on the row time from a start in s."""
-    size, sign = abs(row_time), math.copysign(1.0, row_time)
-    for _ in range(8):
-        found, step = _evaluated(places, sign * size, spacing)
-        change = min(max(sign * step, -GRID_STEP * size), GRID_STEP * size)
-        size = min(max(size + change, low), high)
-        if abs(change) < 1e-2 * found.std:
-            break
-    return _evaluated(places, sign * size, spacing)[0]
+    return refined(lambda tried: _evaluated(places, tried, spacing), row_time, low, high)

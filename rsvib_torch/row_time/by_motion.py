@@ -27,8 +27,7 @@ from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.results.reason import Reason
 from rsvib_torch.row_time import RowTimeCalibration
 from rsvib_torch.row_time.by_free_motion import row_time_of_splines
-from rsvib_torch.row_time.by_tones import CameraClock, bands_of_frames, row_time_of_tones
-from rsvib_torch.row_time.row_tones import FramePlaces, RowTimeFit
+from rsvib_torch.row_time.by_tones import CameraClock, FramePlaces, RowTimeFit, bands_of_frames, row_time_of_tones
 
 P = ParamSpec("P")
 
