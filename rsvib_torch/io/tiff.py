@@ -251,27 +251,46 @@ def _metadata(tif: tifffile.TiffFile, info: StackInfo) -> dict[str, Tag | None]:
 
     Descriptions of the arrangement of its pages (OME, ImageJ) are copied only if those of the output will be the same.
     """
+    first = tif.pages.first
     numbers = sorted({1, len(tif.pages) - 1})  # a sample: values differ in all pages or in none
     others = [cast(tifffile.TiffPage, tif.pages.get(number)) for number in numbers if 0 < number < len(tif.pages)]
     found: dict[str, Tag | None] = {}
-    for tag in tif.pages.first.tags:
-        private = tag.code >= _FIRST_PRIVATE and tag.code not in _STORAGE
-        if tag.code == _DESCRIPTION or not (tag.code in _COPIED or private or tag.code == _SUBIFDS):
-            continue
-        name = tag.name if not tag.name.isdecimal() else f"tag {tag.name}"
-        values = [_value(page.tags.get(tag.code)) for page in (tif.pages.first, *others)]
-        if tag.code not in _COPIED or values[0] is None:
-            found[name] = None
-        elif any(value not in (None, values[0]) for value in values[1:]):
+
+    def add(name: str, values: Sequence[Any], code: int, dtype: int, count: int, scope: Scope) -> None:
+        """Add the values of the first page and of the others, in which they may be missing."""
+        if any(value not in (None, values[0]) for value in values[1:]):
             found[f"{name} (differs between pages)"] = None
         else:
-            found[name] = Tag(tag.code, int(tag.dtype), tag.count, values[0], None in values[1:], _COPIED[tag.code])
-    x, y, unit = (_value(tif.pages.first.tags.get(code)) for code in (282, 283, 296))
+            once = code == _DESCRIPTION or None in values[1:]
+            found[name] = None if values[0] is None else Tag(code, dtype, count, values[0], once, scope)
+
+    for tag in first.tags:
+        name = tag.name if not tag.name.isdecimal() else f"tag {tag.name}"
+        if tag.code in _COPIED:
+            values = [_value(page.tags.get(tag.code)) for page in (first, *others)]
+            add(name, values, tag.code, int(tag.dtype), tag.count, _COPIED[tag.code])
+        elif (tag.code >= _FIRST_PRIVATE and tag.code not in _STORAGE) or tag.code == _SUBIFDS:
+            found[name] = None
+    x, y, unit = (_value(first.tags.get(code)) for code in (282, 283, 296))
     rational = all(isinstance(scale, tuple) and len(scale) == 2 and min(scale) > 0 for scale in (x, y))
     if rational and unit == 1 and (x, y) != ((1, 1), (1, 1)):
         found[_RESOLUTION] = Tag(282, 5, 2, (x, y), False, "image")
-    same_pages = info.axes == "THW" or (info.channels_last and info.shape[1] in (3, 4))
-    return found | _descriptions(tif, others, info.shape[0] if same_pages else -1)
+    # Descriptions of all pages together are valid if the same pages will be written.
+    same = info.axes == "THW" or (info.channels_last and info.shape[1] in (3, 4))
+    stated, text = [_stated(page) for page in (first, *others)], _free_text(first)
+    if stated[0]:
+        add(_JSON, stated, _DESCRIPTION, 2, 0, "file")
+    values = dict(tif.imagej_metadata or {})
+    if values:
+        values.pop(_IMAGEJ_KEY, None)
+        values["axes"] = f"{'Z' if 'slices' in values else 'T'}YX" + "S" * (first.axes == "YXS")
+        add("ImageJ metadata", [values if same else None], _IMAGEJ, 1, 0, "stack")
+    elif first.is_ome:
+        single = same and info.shape[0] == len(tif.pages) and "FileName=" not in text
+        add("OME-XML", [text if single else None], _DESCRIPTION, 2, 0, "stack")
+    elif text:
+        add("ImageDescription", [text, *(_free_text(page) or None for page in others)], _DESCRIPTION, 2, 0, "file")
+    return found
 
 
 def _value(tag: tifffile.TiffTag | None) -> Any:
@@ -283,40 +302,17 @@ def _value(tag: tifffile.TiffTag | None) -> Any:
     return value if all(isinstance(part, (int, float, str, bytes)) for part in parts) else None
 
 
-def _descriptions(tif: tifffile.TiffFile, others: Sequence[tifffile.TiffPage], frames: int) -> dict[str, Tag | None]:
-    """Descriptions of the first page; ``frames`` of the file that will be written as the same pages."""
-    first = tif.pages.first
-    found: dict[str, Tag | None] = {}
-    written = {key: value for key, value in _parsed(first.shaped_description or "").items() if key not in _LAYOUT_KEYS}
-    if written:
-        alike = all(_parsed(page.shaped_description or "").items() >= written.items() for page in others)
-        alike |= all(not page.shaped_description for page in others)
-        name = _JSON if alike else f"{_JSON} (differs between pages)"
-        found[name] = _text(json.dumps(written), "file") if alike else None
-    text = _free_text(first)
-    values = dict(tif.imagej_metadata or {})
-    if values:
-        values.pop(_IMAGEJ_KEY, None)
-        values["axes"] = f"{'Z' if 'slices' in values else 'T'}YX" + "S" * (first.axes == "YXS")
-        found["ImageJ metadata"] = Tag(_IMAGEJ, 1, 0, values, True, "stack") if frames > 0 else None
-    elif first.is_ome:
-        single = frames == len(tif.pages) and "FileName=" not in text
-        found["OME-XML"] = _text(text, "stack") if single else None
-    elif text and any(_free_text(page) not in ("", text) for page in others):
-        found["ImageDescription (differs between pages)"] = None
-    elif text:
-        found["ImageDescription"] = _text(text, "file")
-    return found
+def _stated(page: tifffile.TiffPage) -> str | None:
+    """What the JSON description of a page states besides the layout; None if there is nothing."""
+    parsed = _parsed(page.shaped_description or "")
+    stated = {key: parsed[key] for key in sorted(parsed) if key not in _LAYOUT_KEYS}
+    return json.dumps(stated) if stated else None
 
 
 def _free_text(page: tifffile.TiffPage) -> str:
     """The description of a page that is not that of tifffile."""
     texts = (page.description, page.description1)
     return next((text for text in texts if text and text != page.shaped_description), "")
-
-
-def _text(text: str, scope: Scope) -> Tag:
-    return Tag(_DESCRIPTION, 2, 0, text, True, scope)
 
 
 def _writer_options(info: StackInfo, description: Mapping[str, object]) -> Table:
