@@ -341,14 +341,9 @@ def fit_clock(
         change = inverse @ right
         known = max(float(measured.num_measurements.sum()), 8.0) - free.sum()
         covariance = inverse * (measured.square(residual).sum() / known)
-        at, speedup, gain_x, gain_y, drift_x, drift_y = change.tolist()
-        clock = FittedClock(
-            clock.at + at,
-            max(clock.scale + speedup, 0.1 * clock.scale),
-            (clock.gain[0] + gain_x, clock.gain[1] + gain_y),
-            (clock.drift[0] + drift_x, clock.drift[1] + drift_y),
-            clock.middle,
-        )
+        at, speed_of_clock, *others = (np.array([clock.at, clock.scale, *clock.gain, *clock.drift]) + change).tolist()
+        gain, drift = (others[0], others[1]), (others[2], others[3])
+        clock = FittedClock(at, max(speed_of_clock, 0.1 * clock.scale), gain, drift, clock.middle)
         if (np.abs(change) <= 1e-3 * np.sqrt(np.maximum(covariance.diagonal(), 0.0))).all():
             break
     return clock, covariance

@@ -118,10 +118,8 @@ def write_hdf5(path: Path, info: StackInfo, frames: Iterator[Array], compression
         layout.set_layout(h5py.h5d.CONTIGUOUS)
         layout.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
         layout.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
-        layout.set_obj_track_times(False)
-        space = h5py.h5s.create_simple(info.stored_shape)
-        kind = h5py.h5t.py_create(np.dtype(info.dtype).newbyteorder("<"))
-        dataset = h5py.Dataset(h5py.h5d.create(file.id, _DATASET.encode(), kind, space, layout))
+        kind = np.dtype(info.dtype).newbyteorder("<")
+        dataset = file.create_dataset(_DATASET, info.stored_shape, kind, dcpl=layout, track_times=False)
         dataset.attrs.update(attributes_of(info))
         offset = int(dataset.id.get_offset())
     with path.open("r+b") as pixels:
