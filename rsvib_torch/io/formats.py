@@ -6,13 +6,12 @@ from pathlib import Path
 from typing import Literal
 
 from rsvib_torch.files.reading import check_regular
+from rsvib_torch.io.array_stores import open_hdf5, open_zarr, write_hdf5, write_zarr
 from rsvib_torch.io.flat_files import check_npy, open_npy, open_raw, write_npy, write_raw
-from rsvib_torch.io.hdf5 import open_hdf5, write_hdf5
 from rsvib_torch.io.images import check_images, open_images, write_images
 from rsvib_torch.io.stack_info import FFV1, H264, READ_ONLY_VIDEO, FrameReader, StackInfo
 from rsvib_torch.io.tiff import open_tiff, write_tiff
 from rsvib_torch.io.video import VideoReader, check_video, write_video
-from rsvib_torch.io.zarr_store import open_zarr, write_zarr
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.text import quoted
 
