@@ -13,7 +13,7 @@ import rsvib_torch as rsv
 from rsvib_torch.config import read_config
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.io.stack_info import StackInfo
-from rsvib_torch.row_time.by_free_motion import row_time_of_splines
+from rsvib_torch.row_time.by_motion import row_time_of_splines
 from rsvib_torch.row_time.by_tones import FramePlaces
 
 HEIGHT, WIDTH, FRAMES = 192, 144, 5
