@@ -6,6 +6,8 @@ those that are not are named, so that the user learns what is lost.
 
 import json
 import math
+import re
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
@@ -174,32 +176,29 @@ def open_tiff(path: Path) -> BlockReader:
         # 2. The stack: an axis of frames, one of channels, and the image; axes of length 1 mean nothing.
         sizes = [(axis, size) for axis, size in zip(axes, shape, strict=True) if size > 1 or axis in "YX"]
         axes, shape = "".join(axis for axis, _ in sizes), tuple(size for _, size in sizes)
-        channels = [place for place, axis in enumerate(axes) if axis in "SC"]
-        times = [place for place, axis in enumerate(axes) if axis not in "SCYX"]
-        last = axes.endswith(("YXS", "YXC"))
-        if len(channels) > 1 or len(times) > 1 or "YX" not in axes:
-            raise ValueError(f"axes {axes} of sizes {shape}; expected one axis of frames, one of channels, and YX")
-        order = [*times, *channels, axes.index("Y"), axes.index("X")]
-        stack = tuple(shape[place] for place in order) if times else (1, *(shape[place] for place in order))
-        info = _info(tif, stack, dtype, first.photometric, channels_last=last)
+        order = re.fullmatch("(?P<time>[^SCYX])?([SC])?YX(?P<last>[SC])?", axes)
+        if order is None or (order[2] and order["last"]):
+            raise ValueError(f"axes {axes} of sizes {shape}; expected an axis of frames, one of channels, and YX")
+        stack = shape if order["time"] else (1, *shape)
+        stack = (stack[0], stack[3], *stack[1:3]) if order["last"] else stack
+        info = _info(tif, stack, dtype, first.photometric, channels_last=order["last"] is not None)
         if series is None and len(numbers) < len(headers):
             info = replace(info, metadata={**info.metadata, "thumbnails and masks": None})
         # 3. Its frames: one after another, or in one or several pages.
-        if offset is not None and (order == sorted(order) or (last and times in ([], [0]))):
+        if offset is not None:
             return contiguous_reader(path, info, offset, dtype.newbyteorder(tif.byteorder))
         _check_complete(complete, info.shape[0] * info.frame_bytes, size)
         over_pages = shape[: len(shape) - len(first.shape)]
-        if math.prod(over_pages) != len(numbers) or (times and times[0] >= len(over_pages)):
+        if math.prod(over_pages) != len(numbers) or (order["time"] and not over_pages):
             raise ValueError(f"axes {axes}: a page has several frames; expected one frame per page")
-        arranged = np.array(numbers).reshape(over_pages)
-        of_frames = (np.moveaxis(arranged, times[0], 0) if times else arranged).reshape(info.shape[0], -1).tolist()
+        of_frames = np.array(numbers).reshape(info.shape[0], -1).tolist()
 
         def read(first: int, _: int) -> Array:
             of_frame = [pages[number] for number in of_frames[first]]
             if not all(_is_complete(page, size) for page in of_frame):
                 raise FrameError(f"{path}: truncated: pixels of frame {first} lie beyond the end of the file")
             stored = np.stack([page.asarray(maxworkers=1) for page in of_frame if page is not None])
-            return (np.moveaxis(stored, -1, 1) if last else stored).reshape(1, *info.shape[1:])
+            return (np.moveaxis(stored, -1, 1) if info.channels_last else stored).reshape(1, *info.shape[1:])
 
         return BlockReader(path, info, read, close=opened.pop_all().close)
 
@@ -211,9 +210,7 @@ _JSON = "JSON metadata"  # keys of the description that tifffile writes
 _RESOLUTION = "resolution"  # without a unit of length, which ImageJ states in the description
 # keys of that description for the reader only
 _LAYOUT_KEYS = ("shape", "axes", "truncated", "full_scale", "frame_times", "frame_rate")
-_IMAGEJ_KEY = (
-    "rsvib"  # of JSON in an ImageJ description: ImageJ uses the last description, so that there is no other one
-)
+_IMAGEJ_KEY = "rsvib"  # of JSON in an ImageJ description: ImageJ uses the last description, so there is no other one
 
 _OF_THE_FILE = (
     "DocumentName Make Model DateTime Artist HostComputer XMP Copyright ExposureTime FNumber IPTCNAA InterColorProfile "
@@ -378,4 +375,6 @@ def write_tiff(
         pages = (plane for frame in pages for plane in frame)
     # an iterator would have to yield the tiles
     data = np.stack(list(pages)).reshape(stored.stored_shape) if "tile" in storage else pages
-    tifffile.imwrite(path, data=data, maxworkers=1, **{"compression": compression, **storage, **options})
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".* truncating ImageJ file")  # from 4 GB on, as ImageJ does: only one header
+        tifffile.imwrite(path, data=data, maxworkers=1, **{"compression": compression, **storage, **options})

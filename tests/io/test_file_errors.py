@@ -49,7 +49,7 @@ def test_tiff_truncated_anywhere_is_refused(tmp_path, kind):
     [
         ((9, 7), "uint8", {"photometric": "miniswhite"}, "MINISWHITE"),
         ((9, 8), "bool", {}, "pixels are bool"),
-        ((2, 5, 9, 7), "uint8", {"metadata": {"axes": "TZYX"}}, "one axis of frames"),
+        ((2, 5, 9, 7), "uint8", {"metadata": {"axes": "TZYX"}}, "an axis of frames"),
     ],
 )
 def test_tiff_files_that_are_not_stacks_are_refused(tmp_path, shape, dtype, options, message):
