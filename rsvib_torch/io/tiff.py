@@ -281,7 +281,10 @@ def _metadata(tif: tifffile.TiffFile, info: StackInfo) -> dict[str, Tag | None]:
     if values:
         values.pop(_IMAGEJ_KEY, None)
         values["axes"] = f"{'Z' if 'slices' in values else 'T'}YX" + "S" * (first.axes == "YXS")
-        add("ImageJ metadata", [values if same else None], _IMAGEJ, 1, 0, "stack")
+        known = same and (
+            info.dtype == "uint8" or (info.axes == "THW" and info.dtype in ("uint16", "int16", "float32"))
+        )
+        add("ImageJ metadata", [values if known else None], _IMAGEJ, 1, 0, "stack")
     elif first.is_ome:
         single = same and info.shape[0] == len(tif.pages) and "FileName=" not in text
         add("OME-XML", [text if single else None], _DESCRIPTION, 2, 0, "stack")

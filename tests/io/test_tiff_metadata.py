@@ -176,6 +176,15 @@ def test_imagej_metadata_are_kept(tmp_path, byteorder, compression):
     assert copied(tmp_path, output="out.npy") == ("resolution", "ImageJ metadata")
 
 
+def test_a_folder_of_imagej_files_with_colours_of_their_own(tmp_path):
+    (tmp_path / "in").mkdir()
+    for index, frame in enumerate(COLOUR[:2, ..., 0]):
+        own = {"LUTs": [np.stack([np.arange(256, dtype=np.uint8)] * 3)], "Ranges": (0.0, 200.0), "mode": "composite"}
+        tifffile.imwrite(tmp_path / "in" / f"{index}.tif", frame, imagej=True, metadata=own)
+    write_stack(tmp_path / "out", read_stack(tmp_path / "in"), dtype="uint8", like=read_stack_info(tmp_path / "in"))
+    assert header(tmp_path / "out" / "1.tif", "imagej_metadata")["Ranges"] == (0.0, 200.0)
+
+
 def test_ome_xml_is_kept(tmp_path):
     metadata = {"axes": "TYX", "PhysicalSizeX": 0.1, "PhysicalSizeXUnit": "um", "Plane": {"ExposureTime": [0.1] * 5}}
     tifffile.imwrite(tmp_path / "in.tif", GREY, ome=True, photometric="minisblack", metadata=metadata)
