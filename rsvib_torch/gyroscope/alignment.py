@@ -284,38 +284,27 @@ def best_offset(
 ) -> tuple[float, float | None]:
     """The offset of the least residual, with a free drift, and another local minimum below twice the least square."""
     every = max(1, measured.exposure_starts.shape[1] // 400)  # 400 scene rows are enough for a start
-    used = np.flatnonzero((measured.weights[0] > 0).all(-1))[::every]
-    exposure_starts = tensor(measured.exposure_starts[0, used] + 0.5 * measured.exposure_time)
-    seen = tensor(measured.visible[0, used])
-    values = (tensor(measured.displacements[0, used]) * seen[..., None]).flatten(0, 1)
-    weight = (tensor(measured.weights[0, used])[:, None] * seen[..., None]).flatten(0, 1)
-
-    def relative(of: Tensor) -> Tensor:  # (..., N, G, A)
-        mean = (of * seen[..., None]).sum(-2, keepdim=True) / seen.sum(-1)[..., None, None].clamp(min=1.0)
-        return ((of - mean) * seen[..., None]).flatten(-3, -2)
-
-    drift = relative(exposure_starts[..., None].expand(-1, -1, 2))
-    norm = (weight * drift.square()).sum(0).clamp(min=1e-300)
+    rows = measured.of_rows(np.flatnonzero((measured.weights[0] > 0).all(-1))[::every])
+    starts = rows.exposure_starts + 0.5 * rows.exposure_time
+    weight = rows.weights[:, :, None] * rows.visible[..., None]
+    drift = rows.relative(np.repeat(starts[..., None], 2, -1))
+    norm = (weight * np.square(drift)).sum((1, 2)).clip(min=1e-300)
     step = max(0.5 * recorded.spacing, 4 * timing.row_time, (high - low) / 20000)  # at most 20,000 offsets
-    grid = torch.linspace(
-        low, high, max(2, math.ceil((high - low) / step) + 1), dtype=torch.float64, device=drift.device
-    )
+    grid = np.linspace(low, high, max(2, math.ceil((high - low) / step) + 1))
     costs = []
-    for part in grid.split(128):  # (128, N G, 2) values at a time
-        residual = values - relative(recorded.displacement(part[:, None, None] + exposure_starts))
-        along = (weight * drift * residual).sum(-2) / norm
+    for part in np.split(grid, range(128, len(grid), 128)):  # (128, N, G, 2) values at a time
+        moved = table(recorded.displacement(tensor(part[:, None, None] + starts)))
+        residual = rows.displacements * rows.visible[..., None] - rows.relative(moved)
+        along = (weight * drift * residual).sum((1, 2)) / norm
         # both axes together, as one of them may be at rest; without the largest fifth: clouds
-        size = (weight * (residual - along[:, None] * drift).square()).sum(-1)
-        kept = size.sort(dim=-1).values[:, : math.ceil(0.8 * size.shape[-1])]
-        costs.append(kept.sum(-1))
-    cost = torch.cat(costs)
-    best = int(cost.argmin())
-    padded = torch.nn.functional.pad(cost, (1, 1), value=math.inf)
-    valleys = (padded[1:-1] <= padded[:-2]) & (padded[1:-1] <= padded[2:]) & (cost < 2.0 * cost[best] + 1e-300)
+        size = (weight * np.square(residual - along[:, None, None] * drift)).sum(-1).reshape(len(part), -1)
+        costs.append(np.sort(size)[:, : math.ceil(0.8 * size.shape[-1])].sum(-1))
+    cost = np.concatenate(costs)
+    best, padded = int(cost.argmin()), np.pad(cost, 1, constant_values=math.inf)
+    valleys = (cost <= padded[:-2]) & (cost <= padded[2:]) & (cost < 2.0 * cost[best] + 1e-300)
     valleys[best] = False
-    others = valleys.nonzero()[:, 0]
-    other = float(grid[others[cost[others].argmin()]]) if len(others) else None
-    return float(grid[best]), other
+    others = np.flatnonzero(valleys)
+    return float(grid[best]), float(grid[others[cost[others].argmin()]]) if len(others) else None
 
 
 def fit_clock(
@@ -446,10 +435,15 @@ def check_motion(frames: FramesOrFiles, timing: SensorTiming, motion: Motion, op
         raise ValueError("check_motion takes one stack, not a batch")
     measured = start_of_stack(stack, timing, options)[1].measurements
     turned = motion.to("cpu").to_row_order(timing)
-    offsets = _offsets(tensor(measured.displacements))
-    residual = offsets - _offsets(_averaged(turned, measured))
     used = tensor(measured.weights[0].min(-1) > 0)
-    before, after = (offsets_from_row_order(_rms(values[used]), timing).abs() for values in (offsets, residual))
+
+    def of_bands(displacements: Tensor) -> Tensor:
+        """(N, 2) px, later less earlier displacement of pairs (1, N, 2, 2), in image axes."""
+        return offsets_from_row_order((displacements[0, :, 1] - displacements[0, :, 0])[used], timing)
+
+    offsets = of_bands(tensor(measured.displacements))
+    residual = offsets - of_bands(_averaged(turned, measured))
+    before, after = _rms(offsets), _rms(residual)
     findings = []
     for name, moved, rest in zip(AXIS_NAMES, before.tolist(), after.tolist(), strict=False):
         largest, expected = moved + _MIN_CHANGE, max(0.5 * moved, _MIN_CHANGE)
@@ -457,18 +451,11 @@ def check_motion(frames: FramesOrFiles, timing: SensorTiming, motion: Motion, op
             findings.append(Reason("motion_enlarges_offsets", name, rest, largest, {"moved": moved}))
         elif rest > expected and moved > 2 * _MIN_CHANGE:
             findings.append(Reason("motion_leaves_offsets", name, rest, expected, {"moved": moved}))
-    of_bands = (offsets_from_row_order(values[used], timing) for values in (offsets, residual))
     rest, moved = float(after.norm()), float(before.norm())
     if rest >= moved and not findings:
         findings.append(Reason("offsets_not_reduced", None, rest, moved))
-    return MotionCheck(
-        before, after, rest < moved, tuple(findings), tensor(measured.exposure_starts[0, :, 0])[used], *of_bands
-    )
-
-
-def _offsets(displacements: Tensor) -> Tensor:
-    """(N, 2) px, displacement in the later frame less that in the earlier one, of pairs (1, N, 2, 2)."""
-    return displacements[0, :, 1] - displacements[0, :, 0]
+    times = tensor(measured.exposure_starts[0, :, 0])[used]
+    return MotionCheck(before, after, rest < moved, tuple(findings), times, offsets, residual)
 
 
 def _averaged(motion: Motion, measured: Measurements) -> Tensor:
