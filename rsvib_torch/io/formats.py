@@ -1,4 +1,4 @@
-"""The table of stack formats, their contract, and the choice of a format by the ending of a file name."""
+"""The table of stack formats, and the choice of a format by the ending of a file name."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -16,28 +16,9 @@ from rsvib_torch.numerics.tables import Array
 from rsvib_torch.text import quoted
 
 
-# Contract of a format. All functions are called with the path of the stack; ``write`` with that of a temporary file or
-# folder, which the caller renames when it is complete (``rsvib_torch/files/atomic.py``).
-#
-# Shapes:      frames are (H, W) or (C, H, W), channels RGB or RGBA; ``StackInfo.shape`` is (T, H, W) or (T, C, H, W),
-#              also if the file stores channels last (``StackInfo.from_stored``, ``to_stored``).
-# Data types:  one of ``dtypes`` in native byte order; pixels are returned as stored, without scaling.
-# Full scale:  ``info.full_scale`` is the count that corresponds to 1.0, or None if the file does not state it; formats
-#              that have room for it store it (``known_full_scale`` supplies 255 for uint8).
-# Frame times: exposure starts in seconds, or None; times that are not exact need ``time_error`` and ``time_source``.
-# Orientation: frames have the rows and columns of the file; ``info.orientation`` states how they are displayed.
-# Metadata:    ``keeps`` states what the format stores besides pixels; users are told what their file loses.
-# Reading:     ``open`` must not allocate memory by sizes in a header before it has compared them with the size of the
-#              file, must not decode pixels, execute code or follow links to other files, and raises an ``OSError`` if
-#              the file cannot be opened, a one-line ``ValueError`` that names the file if it is not a stack
-#              (``readable_stack``), and ``ModuleNotFoundError`` if a package is missing (``needed_package``). A reader
-#              raises ``FrameError`` for a damaged frame (``readable_frame``); opening fails if more than half of the
-#              frames are missing. Frames that are stored together are decoded once (``io/blocks.py``);
-#              ``info.decoding_bytes`` is the memory that this needs.
-# Writing:     ``write`` takes the frames one after another; the caller synchronises the files with the disk.
 @dataclass(frozen=True)
 class StackFormat:
-    """How stacks are stored in files with certain endings."""
+    """How stacks are stored in files with certain endings; docs/stacks.md, "Other formats", has the contract."""
 
     name: str  # in messages
     endings: tuple[str, ...]  # lower case with the dot; ``""`` is a name without an ending
