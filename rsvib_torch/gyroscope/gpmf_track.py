@@ -26,10 +26,6 @@ _NUMBERS = {
 }  # fmt: skip
 
 
-class _NoTrackError(ValueError):
-    """A video has no GPMF track."""
-
-
 def is_mp4(head: bytes) -> bool:
     """Whether a file begins as an MP4 or QuickTime file."""
     return head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
@@ -42,7 +38,9 @@ def read_gpmf(path: Path) -> tuple[Array, Array, str, str]:
     except (struct.error, IndexError) as error:
         raise ValueError(f"{path}: damaged MP4 file: {error}") from error
     if not parts:
-        raise ValueError(f"{path}: the GPMF track has no angular rates (GYRO)")
+        raise ValueError(
+            f"{path}: a video without a GPMF track (gpmd) that has angular rates (GYRO); read them from another file"
+        )
     orientation = parts[0].orientation
     source = f"GPMF track, {len(parts)} packets" + (f", axes {orientation}" if orientation else "")
     if max(part.turned for part in parts) > _SMALLEST_TURN:
@@ -78,7 +76,7 @@ def read_camera_track(path: Path) -> CameraTrack | None:
     with path.open("rb") as file:
         if not is_mp4(file.read(64)):
             return None
-    times, exposures, turned = [np.zeros(0)], [np.zeros(0)], 0.0
+    times, exposures, turned, packet = [np.zeros(0)], [np.zeros(0)], 0.0, None
     try:
         for packet in _packets(path):
             for stream in (stream for _, streams in packet.devices() for stream in streams):
@@ -87,13 +85,11 @@ def read_camera_track(path: Path) -> CameraTrack | None:
                     times.append(packet.start + packet.duration / len(shutter) * np.arange(len(shutter)))
                     exposures.append(shutter[:, 0])
                 turned = max(turned, _largest_turn(stream))
-    except _NoTrackError:
-        return None
     except (ValueError, struct.error, IndexError) as error:
         problem = str(error).removeprefix(f"{path}: ")
         warnings.warn(f"{path}: the GPMF track is damaged and is not used: {problem}", stacklevel=2)
         return None
-    return CameraTrack(np.concatenate(times), np.concatenate(exposures), turned)
+    return None if packet is None else CameraTrack(np.concatenate(times), np.concatenate(exposures), turned)
 
 
 _Stream = dict[bytes, tuple[bytes, int, bytes]]  # type, size of a value and content of the entries of each key
@@ -118,7 +114,7 @@ class _Packet:
 
 
 def _packets(path: Path) -> Iterator[_Packet]:
-    """Packets of the first GPMF track."""
+    """Packets of the first GPMF track; none without one."""
     av = needed_package("av", "reading the gyroscope of a video", "video")
     try:
         with av.open(str(path), format="mp4") as container:
@@ -137,7 +133,6 @@ def _packets(path: Path) -> Iterator[_Packet]:
                 container.seek(0)
     except av.error.FFmpegError as error:
         raise ValueError(f"{path}: damaged MP4 file: {error.strerror}") from error
-    raise _NoTrackError(f"{path}: a video without a GPMF track (gpmd); read its gyroscope from another file")
 
 
 @dataclass(frozen=True)
