@@ -76,7 +76,7 @@ def read_camera_track(path: Path) -> CameraTrack | None:
     with path.open("rb") as file:
         if not is_mp4(file.read(64)):
             return None
-    times, exposures, turned, packet = [np.zeros(0)], [np.zeros(0)], 0.0, None
+    times, exposures, turned, packet = list[Array]([np.zeros(0)]), list[Array]([np.zeros(0)]), 0.0, None
     try:
         for packet in _packets(path):
             for stream in (stream for _, streams in packet.devices() for stream in streams):
@@ -109,8 +109,8 @@ class _Packet:
             if key == b"DEVC":
                 entries = [(name, content) for name, *_, content in _entries(device)]
                 number = next((content for name, content in entries if name == b"DVID"), b"")
-                streams = [content for name, content in entries if name == b"STRM"]
-                yield number, [{name: (kind, *rest) for name, kind, *rest in _entries(one)} for one in streams]
+                parts = [_entries(content) for name, content in entries if name == b"STRM"]
+                yield number, [{name: (kind, size, value) for name, kind, size, value in part} for part in parts]
 
 
 def _packets(path: Path) -> Iterator[_Packet]:

@@ -82,7 +82,7 @@ def _find_dataset(file: h5py.File) -> h5py.Dataset:
     if not isinstance(file.get(_NAME, getlink=True, default=h5py.HardLink()), h5py.HardLink):
         raise ValueError(f"its dataset {_NAME!r} is a link; frames must be in the file itself")
     stacks = {name: member for name, member in found.items() if member.ndim > 2 or name == _NAME}
-    dataset: h5py.Dataset = _only(stacks or found)
+    dataset = _only(stacks or found)
     if _is_outside(dataset):
         raise ValueError(f"its dataset {dataset.name} lies in other files; frames must be in the file itself")
     return dataset

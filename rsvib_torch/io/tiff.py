@@ -277,10 +277,10 @@ def _metadata(tif: tifffile.TiffFile, info: StackInfo) -> dict[str, Tag | None]:
     stated, text = [_stated(page) for page in (first, *others)], _free_text(first)
     if stated[0]:
         add(_JSON, stated, _DESCRIPTION, 2, 0, "file")
-    values = dict(tif.imagej_metadata or {})
-    if values:
-        values.pop(_IMAGEJ_KEY, None)
-        values["axes"] = f"{'Z' if 'slices' in values else 'T'}YX" + "S" * (first.axes == "YXS")
+    imagej = dict(tif.imagej_metadata or {})
+    if imagej:
+        imagej.pop(_IMAGEJ_KEY, None)
+        imagej["axes"] = f"{'Z' if 'slices' in imagej else 'T'}YX" + "S" * (first.axes == "YXS")
         known = same and (
             info.dtype == "uint8" or (info.axes == "THW" and info.dtype in ("uint16", "int16", "float32"))
         )
