@@ -284,7 +284,7 @@ def _metadata(tif: tifffile.TiffFile, info: StackInfo) -> dict[str, Tag | None]:
         known = same and (
             info.dtype == "uint8" or (info.axes == "THW" and info.dtype in ("uint16", "int16", "float32"))
         )
-        add("ImageJ metadata", [values if known else None], _IMAGEJ, 1, 0, "stack")
+        add("ImageJ metadata", [imagej if known else None], _IMAGEJ, 1, 0, "stack")
     elif first.is_ome:
         single = same and info.shape[0] == len(tif.pages) and "FileName=" not in text
         add("OME-XML", [text if single else None], _DESCRIPTION, 2, 0, "stack")
