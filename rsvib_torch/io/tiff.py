@@ -281,10 +281,8 @@ def _metadata(tif: tifffile.TiffFile, info: StackInfo) -> dict[str, Tag | None]:
     if imagej:
         imagej.pop(_IMAGEJ_KEY, None)
         imagej["axes"] = f"{'Z' if 'slices' in imagej else 'T'}YX" + "S" * (first.axes == "YXS")
-        known = same and (
-            info.dtype == "uint8" or (info.axes == "THW" and info.dtype in ("uint16", "int16", "float32"))
-        )
-        add("ImageJ metadata", [imagej if known else None], _IMAGEJ, 1, 0, "stack")
+        dtypes = ("uint8", "uint16", "int16", "float32") if info.axes == "THW" else ("uint8",)  # of ImageJ
+        add("ImageJ metadata", [imagej if same and info.dtype in dtypes else None], _IMAGEJ, 1, 0, "stack")
     elif first.is_ome:
         single = same and info.shape[0] == len(tif.pages) and "FileName=" not in text
         add("OME-XML", [text if single else None], _DESCRIPTION, 2, 0, "stack")
