@@ -22,15 +22,15 @@ def layer_of(part, layers):
     raise AssertionError(f"{part!r} has no layer: add it to LAYERS or INNER_LAYERS of scripts/architecture.py")
 
 
-# Modules that import what their callers name; the names are read where they are stated (``packaged_format``).
-IMPORT_BY_NAME = {"rsvib_torch.checks.values", "rsvib_torch.io.formats"}
+# Modules that import what their callers name.
+IMPORT_BY_NAME = {"rsvib_torch.checks.values"}
 
 
 def imported_modules(source, module):
     """Modules of rsvib_torch that a module imports anywhere in its file, with the line: [(line, dotted name)].
 
-    Functions, classes, ``if TYPE_CHECKING`` and ``try`` are included, imports by name, and modules that the table of
-    file formats names (``packaged_format``). An import of a computed name counts as one of the whole package.
+    Functions, classes, ``if TYPE_CHECKING`` and ``try`` are included, and imports by name. An import of a computed
+    name counts as one of the whole package.
     """
     package = module.split(".")
     found = []
@@ -44,7 +44,7 @@ def imported_modules(source, module):
             names = [f"{origin}.{alias.name}" for alias in node.names]
         elif isinstance(node, ast.Call):
             called = getattr(node.func, "id", getattr(node.func, "attr", ""))
-            if called in {"import_module", "__import__", "packaged_format"}:
+            if called in {"import_module", "__import__"}:
                 texts = [entry.value for entry in node.args if isinstance(entry, ast.Constant)]
                 names = [text for text in texts if isinstance(text, str)]
                 if not names and module not in IMPORT_BY_NAME:
@@ -103,14 +103,6 @@ def test_modules_do_not_import_each_other_in_a_cycle():
     assert len(order) >= len(uses)
 
 
-def test_modules_of_file_formats_are_read_as_imports():
-    source = (PACKAGE / "io" / "formats.py").read_text()
-    named = {name for _, name in imported_modules(source, "rsvib_torch.io.formats")}
-    assert {
-        f"rsvib_torch.io.{name}" for name in ("tiff", "flat_files", "hdf5", "images", "video", "zarr_store")
-    } <= named
-
-
 def test_every_part_has_a_layer():
     def parts(folder):
         return {path.stem for path in folder.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
@@ -154,10 +146,6 @@ def test_modules_that_use_a_displacement_per_row_state_the_invariant():
         ("if TYPE_CHECKING:\n    import rsvib_torch.registration", "rsvib_torch.imaging.simulate"),
         ("try:\n    from rsvib_torch import report\nexcept ImportError:\n    pass", "rsvib_torch.stacks.job"),
         ("module = importlib.import_module(NAME)", "rsvib_torch.results.presentation"),
-        (
-            "FORM = packaged_format('a', ('.a',), 'rsvib_torch.stacks.run_folder', 'RunFolder')",
-            "rsvib_torch.io.formats",
-        ),
         ("from rsvib_torch.detection.rows import displacements", "rsvib_torch.detection.tones.fit"),
         ("from rsvib_torch.restoration.exact.exact import restore_exact", "rsvib_torch.restoration.dewarp"),
     ],

@@ -126,7 +126,7 @@ class Measurements:
         """Every stack ``count`` times in a row."""
         return take_stacks([self], np.arange(len(self.exposure_starts)).repeat(count))
 
-    def of_rows(self, rows: slice) -> "Measurements":
+    def of_rows(self, rows: slice | Array) -> "Measurements":
         """The measurements of some rows."""
         names = ("exposure_starts", "displacements", "visible", "information")
         return replace(self, **{name: getattr(self, name)[:, rows] for name in names})

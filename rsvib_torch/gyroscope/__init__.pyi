@@ -1,7 +1,6 @@
-from .alignment import ClockAlignment, align_motion
+from .alignment import ClockAlignment, MotionCheck, align_motion, check_motion
 from .gpmf_track import CameraTrack, read_camera_track
 from .gyroscope_rates import AngularRates
-from .motion_check import MotionCheck, check_motion
 from .read_gyroscope import read_gyroscope
 from .rotation_alignment import RotationAlignment
 

@@ -1,4 +1,4 @@
-"""Alignment of a motion that another instrument recorded with the clock of the frames.
+"""A motion that another instrument recorded: alignment with the clock of the frames, and comparison with them.
 
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from rsvib_torch.checks.validation import Number
 from rsvib_torch.checks.validation import options as option_group
-from rsvib_torch.checks.values import check_single
+from rsvib_torch.checks.values import check_single, described
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.grouped_frames import grouped_frames
 from rsvib_torch.detection.shapes.free import record_of, residual_of_motion, rms_motion, start_of_stack
@@ -35,13 +35,17 @@ from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
 from rsvib_torch.gyroscope.rotation_alignment import RotationAlignment, align_rates, offset_range, outside
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.camera import Camera
+from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.numerics.splines import gauss_legendre
 from rsvib_torch.numerics.tables import Array, table, tensor
 from rsvib_torch.options import OffsetOptions
-from rsvib_torch.results.presentation import JudgedResult
+from rsvib_torch.results.presentation import AXIS_NAMES, JudgedResult
 from rsvib_torch.results.reason import Reason
-from rsvib_torch.text import measured_text, wrapped
+from rsvib_torch.text import measured_text, text_table, wrapped
+
+_MIN_CHANGE = 0.05  # px, registration errors of bands
 
 P = ParamSpec("P")
 
@@ -280,38 +284,27 @@ def best_offset(
 ) -> tuple[float, float | None]:
     """The offset of the least residual, with a free drift, and another local minimum below twice the least square."""
     every = max(1, measured.exposure_starts.shape[1] // 400)  # 400 scene rows are enough for a start
-    used = np.flatnonzero((measured.weights[0] > 0).all(-1))[::every]
-    exposure_starts = tensor(measured.exposure_starts[0, used] + 0.5 * measured.exposure_time)
-    seen = tensor(measured.visible[0, used])
-    values = (tensor(measured.displacements[0, used]) * seen[..., None]).flatten(0, 1)
-    weight = (tensor(measured.weights[0, used])[:, None] * seen[..., None]).flatten(0, 1)
-
-    def relative(of: Tensor) -> Tensor:  # (..., N, G, A)
-        mean = (of * seen[..., None]).sum(-2, keepdim=True) / seen.sum(-1)[..., None, None].clamp(min=1.0)
-        return ((of - mean) * seen[..., None]).flatten(-3, -2)
-
-    drift = relative(exposure_starts[..., None].expand(-1, -1, 2))
-    norm = (weight * drift.square()).sum(0).clamp(min=1e-300)
+    rows = measured.of_rows(np.flatnonzero((measured.weights[0] > 0).all(-1))[::every])
+    starts = rows.exposure_starts + 0.5 * rows.exposure_time
+    weight = rows.weights[:, :, None] * rows.visible[..., None]
+    drift = rows.relative(np.repeat(starts[..., None], 2, -1))
+    norm = (weight * np.square(drift)).sum((1, 2)).clip(min=1e-300)
     step = max(0.5 * recorded.spacing, 4 * timing.row_time, (high - low) / 20000)  # at most 20,000 offsets
-    grid = torch.linspace(
-        low, high, max(2, math.ceil((high - low) / step) + 1), dtype=torch.float64, device=drift.device
-    )
+    grid = np.linspace(low, high, max(2, math.ceil((high - low) / step) + 1))
     costs = []
-    for part in grid.split(128):  # (128, N G, 2) values at a time
-        residual = values - relative(recorded.displacement(part[:, None, None] + exposure_starts))
-        along = (weight * drift * residual).sum(-2) / norm
+    for part in np.split(grid, range(128, len(grid), 128)):  # (128, N, G, 2) values at a time
+        moved = table(recorded.displacement(tensor(part[:, None, None] + starts)))
+        residual = rows.displacements * rows.visible[..., None] - rows.relative(moved)
+        along = (weight * drift * residual).sum((1, 2)) / norm
         # both axes together, as one of them may be at rest; without the largest fifth: clouds
-        size = (weight * (residual - along[:, None] * drift).square()).sum(-1)
-        kept = size.sort(dim=-1).values[:, : math.ceil(0.8 * size.shape[-1])]
-        costs.append(kept.sum(-1))
-    cost = torch.cat(costs)
-    best = int(cost.argmin())
-    padded = torch.nn.functional.pad(cost, (1, 1), value=math.inf)
-    valleys = (padded[1:-1] <= padded[:-2]) & (padded[1:-1] <= padded[2:]) & (cost < 2.0 * cost[best] + 1e-300)
+        size = (weight * np.square(residual - along[:, None, None] * drift)).sum(-1).reshape(len(part), -1)
+        costs.append(np.sort(size)[:, : math.ceil(0.8 * size.shape[-1])].sum(-1))
+    cost = np.concatenate(costs)
+    best, padded = int(cost.argmin()), np.pad(cost, 1, constant_values=math.inf)
+    valleys = (cost <= padded[:-2]) & (cost <= padded[2:]) & (cost < 2.0 * cost[best] + 1e-300)
     valleys[best] = False
-    others = valleys.nonzero()[:, 0]
-    other = float(grid[others[cost[others].argmin()]]) if len(others) else None
-    return float(grid[best]), other
+    others = np.flatnonzero(valleys)
+    return float(grid[best]), float(grid[others[cost[others].argmin()]]) if len(others) else None
 
 
 def fit_clock(
@@ -341,14 +334,142 @@ def fit_clock(
         change = inverse @ right
         known = max(float(measured.num_measurements.sum()), 8.0) - free.sum()
         covariance = inverse * (measured.square(residual).sum() / known)
-        at, speedup, gain_x, gain_y, drift_x, drift_y = change.tolist()
-        clock = FittedClock(
-            clock.at + at,
-            max(clock.scale + speedup, 0.1 * clock.scale),
-            (clock.gain[0] + gain_x, clock.gain[1] + gain_y),
-            (clock.drift[0] + drift_x, clock.drift[1] + drift_y),
-            clock.middle,
-        )
+        at, speed_of_clock, *others = (np.array([clock.at, clock.scale, *clock.gain, *clock.drift]) + change).tolist()
+        gain, drift = (others[0], others[1]), (others[2], others[3])
+        clock = FittedClock(at, max(speed_of_clock, 0.1 * clock.scale), gain, drift, clock.middle)
         if (np.abs(change) <= 1e-3 * np.sqrt(np.maximum(covariance.diagonal(), 0.0))).all():
             break
     return clock, covariance
+
+
+# Comparison
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MotionCheck(
+    JudgedResult,
+    units={"before": "px", "after": "px", "times": "s", "offsets": "px", "residual": "px"},
+    shapes={"before": "2", "after": "2", "times": "N", "offsets": "N 2", "residual": "N 2"},
+):
+    """Offsets of rows between frames, before and after a given motion is subtracted.
+
+    Attributes:
+        before: (2,) px, rms offset of row bands between consecutive frames, axes (x, y), of the nine tenths that fit
+            best: the others may be clouds or registration errors.
+        after: (2,) px, the same of the offsets less those of the motion.
+        helps: Whether the motion reduces the offsets, both axes together.
+        findings: Each ``Reason`` against the motion; ``reasons`` has their texts.
+        times: (N,) s, exposure starts of the registered row bands in the earlier frame of their pair.
+        offsets: (N, 2) px, offsets of these bands, axes (x, y).
+        residual: (N, 2) px, these offsets less those of the motion.
+    """
+
+    before: Tensor
+    after: Tensor
+    helps: bool
+    findings: tuple[Reason, ...]
+    times: Tensor
+    offsets: Tensor
+    residual: Tensor
+
+    def summary(self) -> str:
+        """Offsets before and after the motion is subtracted, and the verdict."""
+        rows = [
+            [name, measured_text(before, digits=3), measured_text(after, digits=3)]
+            for name, before, after in zip("xy", self.before, self.after, strict=True)
+        ]
+        table = text_table(("axis", "offset between frames (px rms)", "without the motion (px rms)"), rows)
+        return "\n".join([table, "the motion reduces the offsets" if self.helps else "not reduced", *self.reasons])
+
+
+class _ChecksMotion(Protocol[P]):
+    """Type of ``check_motion``."""
+
+    def __call__(
+        self, frames: FramesOrFiles, timing: SensorTiming, motion: Motion, *args: P.args, **kwargs: P.kwargs
+    ) -> MotionCheck:
+        """Call the function."""
+
+
+def _check_options(options: Callable[P, OffsetOptions]) -> Callable[[Callable[..., MotionCheck]], _ChecksMotion[P]]:
+    return lambda function: entry_point(options, function)
+
+
+@_check_options(OffsetOptions)
+@full_precision
+@without_gradients
+def check_motion(frames: FramesOrFiles, timing: SensorTiming, motion: Motion, options: OffsetOptions) -> MotionCheck:
+    """Compare a given motion with the offsets of row bands between frames.
+
+    A motion with the wrong sign, clock or focal length makes frames worse: its subtraction increases the offsets.
+
+    Args:
+        frames: Stack (T, H, W) or (T, C, H, W) of at least two frames; tensor, array, list of these, or files; NaN
+            marks missing pixels.
+        timing: The sensor.
+        motion: A vibration or free motion in image axes, on the clock of the frames.
+        options: Options, as in ``detect_vibration``.
+
+    Returns:
+        Rms offsets with and without the motion, and a verdict.
+
+    Raises:
+        ValueError: If frames or motion are a batch, or the frames cannot be registered.
+
+    Example:
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.datasets import example_frames
+        >>> frames, timing, vibration = example_frames()
+        >>> print(rsv.check_motion(frames, timing, vibration))
+        axis  offset between frames (px rms)  without the motion (px rms)
+        x     2.36                            0.0661
+        y     0.576                           0.0953
+        the motion reduces the offsets
+    """
+    if not isinstance(motion, Motion):
+        raise TypeError(f"motion must be a Motion, got {described(motion)}")
+    stack = grey_frames(frames, timing, options)
+    timing = stack.timing
+    check_single("motion", motion)
+    if stack.batched:
+        raise ValueError("check_motion takes one stack, not a batch")
+    measured = start_of_stack(stack, timing, options)[1].measurements
+    turned = motion.to("cpu").to_row_order(timing)
+    used = tensor(measured.weights[0].min(-1) > 0)
+
+    def of_bands(displacements: Tensor) -> Tensor:
+        """(N, 2) px, later less earlier displacement of pairs (1, N, 2, 2), in image axes."""
+        return offsets_from_row_order((displacements[0, :, 1] - displacements[0, :, 0])[used], timing)
+
+    offsets = of_bands(tensor(measured.displacements))
+    residual = offsets - of_bands(_averaged(turned, measured))
+    before, after = _rms(offsets), _rms(residual)
+    findings = []
+    for name, moved, rest in zip(AXIS_NAMES, before.tolist(), after.tolist(), strict=False):
+        largest, expected = moved + _MIN_CHANGE, max(0.5 * moved, _MIN_CHANGE)
+        if rest > largest:
+            findings.append(Reason("motion_enlarges_offsets", name, rest, largest, {"moved": moved}))
+        elif rest > expected and moved > 2 * _MIN_CHANGE:
+            findings.append(Reason("motion_leaves_offsets", name, rest, expected, {"moved": moved}))
+    rest, moved = float(after.norm()), float(before.norm())
+    if rest >= moved and not findings:
+        findings.append(Reason("offsets_not_reduced", None, rest, moved))
+    times = tensor(measured.exposure_starts[0, :, 0])[used]
+    return MotionCheck(before, after, rest < moved, tuple(findings), times, offsets, residual)
+
+
+def _averaged(motion: Motion, measured: Measurements) -> Tensor:
+    """Mean displacement (1, N, 2, 2) over exposure and rows of the bands."""
+    duration = measured.average_times[1]
+    nodes, weights = gauss_legendre(3)
+    mean = torch.zeros_like(tensor(measured.displacements))
+    for node, weight in zip(nodes.tolist(), weights.tolist(), strict=True):
+        times = tensor(measured.exposure_starts) + (node - 0.5) * duration
+        mean = mean + weight * motion.mean_displacement(times, measured.exposure_time)
+    return mean
+
+
+def _rms(offsets: Tensor) -> Tensor:
+    """(2,) rms of the smallest nine tenths of offsets (N, 2)."""
+    square = offsets.square().sort(dim=0).values
+    return square[: max(1, math.ceil(0.9 * len(square)))].mean(0).sqrt()

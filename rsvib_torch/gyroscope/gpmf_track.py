@@ -5,16 +5,16 @@ values, aligned to 4 bytes; entries of type 0 contain entries). A packet holds d
 one stream of each kind the samples (GYRO) after their scale (SCAL).
 """
 
+import math
 import struct
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from rsvib_torch.checks.values import needed_package
-from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, angular_rates
 from rsvib_torch.numerics.tables import Array
 
 _MAX_PACKETS = 10**5  # 28 hours; cameras write one per second
@@ -26,29 +26,26 @@ _NUMBERS = {
 }  # fmt: skip
 
 
-class _NoTrackError(ValueError):
-    """A video has no GPMF track."""
-
-
 def is_mp4(head: bytes) -> bool:
     """Whether a file begins as an MP4 or QuickTime file."""
     return head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
 
 
-def read_gpmf(path: Path) -> AngularRates:
-    """Angular rates of the first gyroscope in the GPMF track of a video."""
+def read_gpmf(path: Path) -> tuple[Array, Array, str, str]:
+    """Times (N,) in s, rates (N, 3) in rad/s, a description and the axes of the first gyroscope in a GPMF track."""
     try:
         parts = list(_parts(_packets(path)))
     except (struct.error, IndexError) as error:
         raise ValueError(f"{path}: damaged MP4 file: {error}") from error
     if not parts:
-        raise ValueError(f"{path}: the GPMF track has no angular rates (GYRO)")
-    rates = np.concatenate([part.rates for part in parts])
+        raise ValueError(
+            f"{path}: a video without a GPMF track (gpmd) that has angular rates (GYRO); read them from another file"
+        )
     orientation = parts[0].orientation
-    source = f"{path.name}, GPMF track, {len(parts)} packets" + (f", axes {orientation}" if orientation else "")
-    if any(part.stabilised for part in parts):
+    source = f"GPMF track, {len(parts)} packets" + (f", axes {orientation}" if orientation else "")
+    if max(part.turned for part in parts) > _SMALLEST_TURN:
         source += ", images that the camera has stabilised (IORI)"
-    return angular_rates(path, _sample_times(parts), rates, source, orientation or "XYZ")
+    return _sample_times(parts), np.concatenate([part.rates for part in parts]), source, orientation or "XYZ"
 
 
 @dataclass(frozen=True)
@@ -79,25 +76,23 @@ def read_camera_track(path: Path) -> CameraTrack | None:
     with path.open("rb") as file:
         if not is_mp4(file.read(64)):
             return None
-    times, exposures, turned = [], [], 0.0
+    times, exposures, turned, packet = list[Array]([np.zeros(0)]), list[Array]([np.zeros(0)]), 0.0, None
     try:
         for packet in _packets(path):
-            for _, streams in _devices(packet.data):
-                for stream in streams:
-                    shutter = _found(stream, b"SHUT")
-                    if shutter is not None and len(shutter) and (shutter > 0).all():
-                        times.append(packet.start + packet.duration / len(shutter) * np.arange(len(shutter)))
-                        exposures.append(shutter[:, 0])
-                    turned = max(turned, _largest_turn(stream))
-    except _NoTrackError:
-        return None
+            for stream in (stream for _, streams in packet.devices() for stream in streams):
+                shutter = _found(stream, b"SHUT")
+                if len(shutter) and (shutter > 0).all():
+                    times.append(packet.start + packet.duration / len(shutter) * np.arange(len(shutter)))
+                    exposures.append(shutter[:, 0])
+                turned = max(turned, _largest_turn(stream))
     except (ValueError, struct.error, IndexError) as error:
         problem = str(error).removeprefix(f"{path}: ")
         warnings.warn(f"{path}: the GPMF track is damaged and is not used: {problem}", stacklevel=2)
         return None
-    if not times:
-        return CameraTrack(np.zeros(0), np.zeros(0), turned)
-    return CameraTrack(np.concatenate(times), np.concatenate(exposures), turned)
+    return None if packet is None else CameraTrack(np.concatenate(times), np.concatenate(exposures), turned)
+
+
+_Stream = dict[bytes, tuple[bytes, int, bytes]]  # type, size of a value and content of the entries of each key
 
 
 @dataclass(frozen=True)
@@ -108,9 +103,18 @@ class _Packet:
     start: float
     duration: float
 
+    def devices(self) -> Iterator[tuple[bytes, list[_Stream]]]:
+        """Number and streams of each device."""
+        for key, *_, device in _entries(self.data):
+            if key == b"DEVC":
+                entries = [(name, content) for name, *_, content in _entries(device)]
+                number = next((content for name, content in entries if name == b"DVID"), b"")
+                parts = [_entries(content) for name, content in entries if name == b"STRM"]
+                yield number, [{name: (kind, size, value) for name, kind, size, value in part} for part in parts]
+
 
 def _packets(path: Path) -> Iterator[_Packet]:
-    """Packets of the first GPMF track."""
+    """Packets of the first GPMF track; none without one."""
     av = needed_package("av", "reading the gyroscope of a video", "video")
     try:
         with av.open(str(path), format="mp4") as container:
@@ -129,24 +133,19 @@ def _packets(path: Path) -> Iterator[_Packet]:
                 container.seek(0)
     except av.error.FFmpegError as error:
         raise ValueError(f"{path}: damaged MP4 file: {error.strerror}") from error
-    raise _NoTrackError(f"{path}: a video without a GPMF track (gpmd); read its gyroscope from another file")
-
-
-# GPMF
 
 
 @dataclass(frozen=True)
 class _Part:
-    """Samples of one packet."""
+    """Samples of one packet; times and numbers that are not stated are NaN."""
 
     rates: Array  # (N, 3) rad/s
-    start: float  # s, time of the packet
-    duration: float  # s
-    stamp: float | None  # s, time of the first sample on the clock of the camera (STMP); None: not stated
-    earliest: float | None  # s, the earliest time that any stream of the packet states
-    total: int | None  # samples up to the end of the packet that it states
+    packet: _Packet
+    stamp: float  # s, time of the first sample on the clock of the camera (STMP)
+    earliest: float  # s, the earliest time that any stream of the packet states
+    total: float  # samples up to the end of the packet
     orientation: str  # axes in the order of the file; empty if they are not stated
-    stabilised: bool = False  # whether the images are turned against the camera
+    turned: float  # rad, largest rotation of the images against the camera
 
 
 def _entries(data: bytes) -> Iterator[tuple[bytes, bytes, int, bytes]]:
@@ -180,61 +179,50 @@ def _parts(packets: Iterator[_Packet]) -> Iterator[_Part]:
     for count, packet in enumerate(packets):
         if count == _MAX_PACKETS:
             raise IndexError(f"more than {_MAX_PACKETS:,} GPMF packets")
-        for number, streams in _devices(packet.data):
-            if chosen is not None and number != chosen:
-                continue
-            stamps = [stamp for stamp in map(_stamp, streams) if stamp is not None]
-            earliest = min(stamps, default=None)
-            part = next(filter(None, (_part(stream, packet, earliest) for stream in streams)), None)
-            if part is not None:
+        for number, streams in packet.devices():
+            gyroscope = next((stream for stream in streams if len(_found(stream, b"GYRO"))), None)
+            if gyroscope is not None and chosen in (None, number):
                 chosen = number
-                yield replace(part, stabilised=max(map(_largest_turn, streams)) > _SMALLEST_TURN)
+                yield _part(gyroscope, streams, packet)
                 break
 
 
-def _devices(data: bytes) -> Iterator[tuple[bytes, list[bytes]]]:
-    """Number and streams of each device in a packet."""
-    for key, *_, device in _entries(data):
-        if key == b"DEVC":
-            entries = [(name, content) for name, *_, content in _entries(device)]
-            number = next((content for name, content in entries if name == b"DVID"), b"")
-            yield number, [content for name, content in entries if name == b"STRM"]
-
-
-def _found(stream: bytes, key: bytes) -> Array | None:
-    """Values (N, C) of the entry of a stream that has a key; None if there is none."""
-    return next((_values(kind, size, content) for name, kind, size, content in _entries(stream) if name == key), None)
-
-
-def _stamp(stream: bytes) -> float | None:
-    """Time of the first sample of a stream in s on the clock of the camera; None if it is not stated."""
-    stamp = _found(stream, b"STMP")
-    return None if stamp is None else float(stamp[0, 0]) * 1e-6
-
-
-def _largest_turn(stream: bytes) -> float:
-    """Largest rotation in rad of the images against the camera (IORI, quaternions w, x, y, z); 0 without."""
-    quaternions = _found(stream, b"IORI")
-    if quaternions is None or not len(quaternions) or quaternions.shape[1] != 4:
-        return 0.0
-    return float(2 * np.arctan2(np.linalg.norm(quaternions[:, 1:], axis=1), np.abs(quaternions[:, 0])).max())
-
-
-def _part(stream: bytes, packet: _Packet, earliest: float | None) -> _Part | None:
-    """Samples of a stream; None if it has no angular rates."""
-    rates = _found(stream, b"GYRO")
-    if rates is None or not len(rates):
-        return None
+def _part(gyroscope: _Stream, streams: list[_Stream], packet: _Packet) -> _Part:
+    """Samples of the stream of a gyroscope, one of those of its device."""
+    rates, scale = _found(gyroscope, b"GYRO"), _found(gyroscope, b"SCAL").ravel()
     if rates.shape[1] != 3:
         raise IndexError(f"GYRO with {rates.shape[1]} values per sample")
-    scale, total = _found(stream, b"SCAL"), _found(stream, b"TSMP")
-    scale = np.ones(1) if scale is None else scale.ravel()
-    if len(scale) not in (1, 3) or not (scale != 0).all():
+    if len(scale) not in (0, 1, 3) or not (scale != 0).all():
         raise IndexError("GYRO with a wrong SCAL")
-    letters = next((content for name, *_, content in _entries(stream) if name == b"ORIN"), b"")
-    orientation = letters.decode("latin-1").strip("\0 ")
-    samples = None if total is None else int(total[0, 0])
-    return _Part(rates / scale, packet.start, packet.duration, _stamp(stream), earliest, samples, orientation)
+    stamps = [1e-6 * _first(stream, b"STMP") for stream in streams if b"STMP" in stream]
+    return _Part(
+        rates / scale if len(scale) else rates,
+        packet,
+        1e-6 * _first(gyroscope, b"STMP"),
+        min(stamps, default=math.nan),
+        _first(gyroscope, b"TSMP"),
+        gyroscope.get(b"ORIN", (b"", 0, b""))[2].decode("latin-1").strip("\0 "),
+        max(map(_largest_turn, streams)),
+    )
+
+
+def _found(stream: _Stream, key: bytes) -> Array:
+    """Values (N, C) of the entry of a stream that has a key; (0, 0) if there is none."""
+    return _values(*stream[key]) if key in stream else np.zeros((0, 0))
+
+
+def _first(stream: _Stream, key: bytes) -> float:
+    """The first value of the entry of a stream that has a key; NaN if there is none."""
+    values = _found(stream, key)
+    return float(values[0, 0]) if values.size else math.nan
+
+
+def _largest_turn(stream: _Stream) -> float:
+    """Largest rotation in rad of the images against the camera (IORI, quaternions w, x, y, z); 0 without."""
+    quaternions = _found(stream, b"IORI")
+    if not len(quaternions) or quaternions.shape[1] != 4:
+        return 0.0
+    return float(2 * np.arctan2(np.linalg.norm(quaternions[:, 1:], axis=1), np.abs(quaternions[:, 0])).max())
 
 
 def _sample_times(parts: list[_Part]) -> Array:
@@ -247,19 +235,19 @@ def _sample_times(parts: list[_Part]) -> Array:
     """
     counts = np.array([len(part.rates) for part in parts])
     ends = np.cumsum(counts)
-    stated = np.array([np.nan if part.total is None else part.total for part in parts])
+    stated = np.array([part.total for part in parts])
     if (np.diff(stated) >= counts[1:]).all():  # samples that are missing have numbers
         ends = (stated - stated[0]).astype(np.int64) + counts[0]
     firsts = (ends - counts).astype(np.float64)
     number = np.concatenate([first + np.arange(count) for first, count in zip(firsts, counts, strict=True)])
-    starts = np.array([part.start for part in parts])
-    duration = parts[-1].start + parts[-1].duration - starts[0]
-    stamps = np.array([np.nan if part.stamp is None else part.stamp for part in parts])
+    starts = np.array([part.packet.start for part in parts])
+    duration = starts[-1] + parts[-1].packet.duration - starts[0]
+    stamps = np.array([part.stamp for part in parts])
     if len(parts) < 3:
         return np.asarray(starts[0] + duration / ends[-1] * number)
     if (np.diff(stamps) > 0).all():
         step = (stamps[-1] - stamps[0]) / firsts[-1]
-        known = np.append(stamps, stamps[-1] + step * counts[-1]) - (parts[0].earliest or 0.0) + starts[0]
+        known = np.append(stamps, stamps[-1] + step * counts[-1]) - parts[0].earliest + starts[0]
         return np.asarray(np.interp(number, np.append(firsts, ends[-1]), known))
     slope, first = np.polyfit(ends[:-1], starts[1:], 1)
     return np.asarray(first + slope * number)

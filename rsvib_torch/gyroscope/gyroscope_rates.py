@@ -3,7 +3,6 @@
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -156,12 +155,3 @@ def orientation_matrix(name: str) -> Tensor:
     for row, letter in enumerate(name):
         matrix[row, "xyz".index(letter.lower())] = 1.0 if letter.isupper() else -1.0
     return matrix
-
-
-def angular_rates(path: Path, times: Array, rates: Array, source: str, orientation: str = "XYZ") -> AngularRates:
-    """The result of a reader, for rates about the axes of an orientation; errors of its values name the file."""
-    try:
-        turned = torch.from_numpy(rates @ orientation_matrix(orientation).numpy().T)
-        return AngularRates(torch.from_numpy(times.copy()), turned, source)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error

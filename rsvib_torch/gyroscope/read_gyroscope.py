@@ -8,18 +8,20 @@ import csv
 import math
 import os
 import re
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
+
+import torch
 
 from rsvib_torch.checks.arguments import checks_arguments
-from rsvib_torch.checks.values import check_choice, check_number
+from rsvib_torch.checks.values import check_number
 from rsvib_torch.files.number_table import rows_of_numbers, text_lines
 from rsvib_torch.files.reading import check_regular
 from rsvib_torch.gyroscope.gpmf_track import is_mp4, read_gpmf
-from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, angular_rates
+from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, orientation_matrix
 from rsvib_torch.motion.recorded import SECONDS, check_times
+from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import TimeUnit
 from rsvib_torch.text import one_line, quoted
 
@@ -32,18 +34,35 @@ _RATE_NAME = re.compile(
 )
 
 
-def _read_table(path: Path, unit: str | None, time_unit: str | None) -> AngularRates:
-    """Angular rates of a CSV file, see ``read_gyroscope``."""
+_MARKS = (b"GYROFLOW IMU LOG", b"CAMERA IMU LOG")  # at the begin of a gyroflow log
+_MAX_HEADER = 1000  # lines
+
+
+def _read_table(path: Path, is_log: bool, unit: str | None, time_unit: str | None) -> tuple[Array, Array, str, str]:
+    """As ``read_gpmf``, of a CSV file with units, or of a gyroflow log, whose header states factors and axes."""
     with path.open(newline="", encoding="utf-8-sig") as file:
         lines = text_lines(path, file)
-        names = [name.strip().lower() for name in next(csv.reader(lines), [])]
-        columns, time_unit, unit = _columns(path, names, time_unit, unit)
-        table = rows_of_numbers(path, lines, names, columns, 2)
-    return angular_rates(path, table[:, 0] * SECONDS[time_unit], table[:, 1:] * _RADIANS[unit], f"{path.name}, CSV")
+        header, count = _header(path, lines) if is_log else ({}, 0)
+        names = [name.strip().lower() for name in (header["t"] if is_log else next(csv.reader(lines), []))]
+        columns, units = _columns(path, names)
+        table = rows_of_numbers(path, lines, names, columns, count + 2)
+    times, rates = table[:, 0], table[:, 1:]
+    if is_log:
+        axes = header.get("orientation", ["", "XYZ"])[1]
+        scales = (_scale(path, header, name) for name in ("tscale", "gscale"))
+        return times * next(scales), rates * next(scales), f"gyroflow log, orientation {axes}", axes
+    for name, given, stated in (("time_unit", time_unit, units["time"]), ("unit", unit, units["rate"])):
+        if len(stated | ({given} - {None})) > 1:
+            kinds = ", ".join(sorted(stated))
+            raise ValueError(f"{path}: the first line states {kinds}" + (f", {name} is {given!r}" if given else ""))
+    rate_unit = unit or next(iter(units["rate"]), None)
+    if rate_unit is None:
+        raise ValueError(f"{path}: the unit of the rates is not stated; pass unit='rad/s' or unit='deg/s'")
+    return times * SECONDS[time_unit or next(iter(units["time"]), "s")], rates * _RADIANS[rate_unit], "CSV", "XYZ"
 
 
-def _columns(path: Path, names: list[str], time_unit: str | None, unit: str | None) -> tuple[list[int], str, str]:
-    """Columns of the time and of the rates about x, y and z, and their units."""
+def _columns(path: Path, names: list[str]) -> tuple[list[int], dict[str, set[str]]]:
+    """Columns of the time and of the rates about x, y and z, and the units that their names state."""
     found: dict[str, int] = {}
     units: dict[str, set[str]] = {"time": set(), "rate": set()}
     for column, name in enumerate(names):
@@ -60,91 +79,36 @@ def _columns(path: Path, names: list[str], time_unit: str | None, unit: str | No
             if match["unit"]:
                 of_rate = "rad/s" if match["unit"].startswith("rad") else "deg/s"
                 units[kind].add(match["unit"] if kind == "time" else of_rate)
-    missing = [quantity for quantity in ("time", "x", "y", "z") if quantity not in found]
-    if missing:
-        what = "time" if missing[0] == "time" else f"rate about {missing[0]}"
-        present = one_line(", ".join(names) or "nothing", 200)
-        raise ValueError(
-            f"{path}: no column of the {what}; expected names such as time, gx, gy, gz in the first line, which has "
-            f"{present}"
-        )
-    for name, given, stated in (("time_unit", time_unit, units["time"]), ("unit", unit, units["rate"])):
-        if len(stated | ({given} - {None})) > 1:
-            kinds = ", ".join(sorted(stated))
-            raise ValueError(f"{path}: the first line states {kinds}" + (f", {name} is {given!r}" if given else ""))
-    rate_unit = unit or next(iter(units["rate"]), None)
-    if rate_unit is None:
-        raise ValueError(f"{path}: the unit of the rates is not stated; pass unit='rad/s' or unit='deg/s'")
-    order = [found[quantity] for quantity in ("time", "x", "y", "z")]
-    return order, time_unit or next(iter(units["time"]), "s"), rate_unit
+    for quantity in ("time", "x", "y", "z"):
+        if quantity not in found:
+            what = "time" if quantity == "time" else f"rate about {quantity}"
+            present = one_line(", ".join(names) or "nothing", 200)
+            raise ValueError(
+                f"{path}: no column of the {what}; expected names such as time, gx, gy, gz in the line of names, which "
+                f"has {present}"
+            )
+    return [found[quantity] for quantity in ("time", "x", "y", "z")], units
 
 
-_MARKS = (b"GYROFLOW IMU LOG", b"CAMERA IMU LOG")
-_MAX_HEADER = 1000  # lines
-_RATES = (("gx", "gy", "gz"), ("rx", "ry", "rz"))  # of version 1.1 and later, and of earlier ones
-
-
-def _is_gcsv(head: bytes) -> bool:
-    """Whether a file begins as a gyroflow log."""
-    return head.removeprefix(b"\xef\xbb\xbf").startswith(_MARKS)
-
-
-def _read_gcsv(path: Path) -> AngularRates:
-    """Angular rates of a gyroflow log."""
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        lines = text_lines(path, file)
-        header, names, count = _header(path, lines)
-        columns = next((list(rates) for rates in _RATES if set(rates) <= set(names)), None)
-        if columns is None:
-            shown = one_line(",".join(names), 100)
-            raise ValueError(f"{path}: columns t, gx, gy and gz expected, the log has {shown}")
-        wanted = ["t", *columns]
-        table = rows_of_numbers(path, lines, names, [names.index(name) for name in wanted], count + 1)
-    orientation = header.get("orientation", "XYZ")
-    times, rates = table[:, 0] * _scale(path, header, "tscale"), table[:, 1:] * _scale(path, header, "gscale")
-    source = f"{path.name}, gyroflow log, orientation {orientation}"
-    return angular_rates(path, times, rates, source, orientation)
-
-
-def _header(path: Path, lines: Iterator[str]) -> tuple[dict[str, str], list[str], int]:
-    """Entries of the header, the names of the columns, and the number of lines up to them."""
-    header: dict[str, str] = {}
-    for count, line in enumerate(lines, 1):
-        cells = [cell.strip() for cell in line.rstrip("\r\n").split(",")]
-        if cells[0] == "t" and len(cells) > 1:
-            return header, cells, count
-        if count > _MAX_HEADER:
-            break
+def _header(path: Path, lines: Iterator[str]) -> tuple[dict[str, list[str]], int]:
+    """Lines of the header of a gyroflow log by their first cell, up to the names of the columns, and their number."""
+    header: dict[str, list[str]] = {}
+    for count, line in zip(range(_MAX_HEADER), lines, strict=False):
+        cells = [cell.strip() for cell in line.split(",")]
         if len(cells) > 1:
-            header[cells[0]] = cells[1]
+            header[cells[0]] = cells
+        if "t" in header:
+            return header, count
     raise ValueError(f"{path}: a gyroflow log without a line of column names, t,gx,gy,gz")
 
 
-def _scale(path: Path, header: dict[str, str], name: str) -> float:
+def _scale(path: Path, header: dict[str, list[str]], name: str) -> float:
+    if name not in header:
+        raise ValueError(f"{path}: the header has no {name}")
     try:
-        return check_number(name, float(header[name]), above=0.0, at_most=1e6)
-    except KeyError:
-        raise ValueError(f"{path}: the header has no {name}") from None
+        return check_number(name, float(header[name][1]), above=0.0, at_most=1e6)
     except ValueError:
-        raise ValueError(f"{path}: {name} must be a positive number, got {quoted(header[name])}") from None
-
-
-@dataclass(frozen=True)
-class _GyroscopeFormat:
-    """A format of gyroscope files, whose ``read`` refuses damaged files with a one-line ``ValueError``."""
-
-    name: str  # in messages
-    matches: Callable[[bytes], bool]  # whether the first 64 bytes of a file are those of this format
-    read: Callable[[Path, RateUnit | None, TimeUnit | None], AngularRates]  # times in s and rates in rad/s
-    has_units: bool = True  # whether the format states its units
-
-
-# A new format is one module and one line. The first that matches is used: CSV has no mark and comes last.
-_FORMATS = (
-    _GyroscopeFormat("gyroflow log (.gcsv)", _is_gcsv, lambda path, *_: _read_gcsv(path)),
-    _GyroscopeFormat("GoPro video with a GPMF track (.mp4)", is_mp4, lambda path, *_: read_gpmf(path)),
-    _GyroscopeFormat("CSV file", lambda _: True, _read_table, has_units=False),
-)
+        raise ValueError(f"{path}: {name} must be a positive number, got {quoted(header[name][1])}") from None
 
 
 @checks_arguments
@@ -188,18 +152,21 @@ def read_gyroscope(
     """
     path = Path(path)
     check_regular(path)
-    if unit is not None:
-        check_choice("unit", unit, get_args(RateUnit))
-    if time_unit is not None:
-        check_choice("time_unit", time_unit, get_args(TimeUnit))
     with path.open("rb") as file:
         head = file.read(64)
-    found = next(one for one in _FORMATS if one.matches(head))
-    if found.has_units and (unit is not None or time_unit is not None):
-        raise ValueError(f"{path}: a {found.name} states its units; omit unit and time_unit")
+    is_log = head.removeprefix(b"\xef\xbb\xbf").startswith(_MARKS)
+    kind = "GoPro video with a GPMF track (.mp4)" if is_mp4(head) else "gyroflow log (.gcsv)" if is_log else "CSV file"
+    if kind != "CSV file" and (unit is not None or time_unit is not None):
+        raise ValueError(f"{path}: a {kind} states its units; omit unit and time_unit")
     try:
-        rates = found.read(path, unit, time_unit)
+        found = read_gpmf(path) if is_mp4(head) else _read_table(path, is_log, unit, time_unit)
     except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"{path}: not a {found.name}: {error}") from error
-    check_times(path, rates.times.numpy(), time_unit or "s", longest_gap=float("inf"))
-    return rates
+        raise ValueError(f"{path}: not a {kind}: {error}") from error
+    times, rates, source, axes = found
+    try:
+        turned = torch.from_numpy(rates @ orientation_matrix(axes).numpy().T)
+        result = AngularRates(torch.from_numpy(times.copy()), turned, f"{path.name}, {source}")
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    check_times(path, times, time_unit or "s", longest_gap=float("inf"))
+    return result

@@ -4,7 +4,6 @@ import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -52,23 +51,6 @@ class BlockReader(FrameReader):
         """Close the file."""
         self._block = None
         self._close()
-
-
-def array_reader(
-    path: Path,
-    info: StackInfo,
-    array: Any,
-    chunk_frames: int,
-    more_bytes: int,
-    close: Callable[[], None] = lambda: None,
-) -> BlockReader:
-    """Reader of an array of HDF5 or Zarr, (T, ...) or a single frame, with chunks of ``chunk_frames`` frames."""
-
-    def read(first: int, last: int) -> Array:
-        frames = np.asarray(array[first:last] if array.ndim > 2 else array[...][None])
-        return np.moveaxis(frames, -1, 1) if info.stored_axes == "THWC" else frames
-
-    return BlockReader(path, info, read, chunk_frames, more_bytes, close)
 
 
 def contiguous_reader(path: Path, info: StackInfo, offset: int, dtype: np.dtype) -> BlockReader:

@@ -29,18 +29,9 @@ def open_npy(path: Path) -> BlockReader:
         check_dtype(dtype)
         if channels_appear_last(shape):
             raise ValueError(f"array of shape {shape} appears to have its channels last; store (T, C, H, W)")
-        info = info_from_attributes({}, shape, dtype)
-        reader = contiguous_reader(path, info, head.tell(), dtype)
-        if not fortran_order:
-            return reader
-        reader.close()
-        # all frames together: the pixels of a frame lie everywhere in the file
-
-        def read(*_: int) -> Array:
-            frames: Array = np.load(path, allow_pickle=False).reshape(info.shape)
-            return frames
-
-        return BlockReader(path, info, read, info.shape[0], info.frame_bytes)
+        if fortran_order:
+            raise ValueError("pixels of a frame lie everywhere in the file; store np.ascontiguousarray(frames)")
+        return contiguous_reader(path, info_from_attributes({}, shape, dtype), head.tell(), dtype)
 
 
 def write_npy(path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None) -> None:

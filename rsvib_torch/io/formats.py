@@ -1,44 +1,24 @@
-"""The table of stack formats, their contract, and the choice of a format by the ending of a file name.
-
-The table is data. The module that reads and writes a format is imported when a stack of that format is opened, checked
-or written (``packaged_format``).
-"""
+"""The table of stack formats, and the choice of a format by the ending of a file name."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
-from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-from rsvib_torch.files.reading import Table, check_regular
+from rsvib_torch.files.reading import check_regular
+from rsvib_torch.io.array_stores import open_hdf5, open_zarr, write_hdf5, write_zarr
+from rsvib_torch.io.flat_files import check_npy, open_npy, open_raw, write_npy, write_raw
+from rsvib_torch.io.images import check_images, open_images, write_images
 from rsvib_torch.io.stack_info import FFV1, H264, READ_ONLY_VIDEO, FrameReader, StackInfo
+from rsvib_torch.io.tiff import open_tiff, write_tiff
+from rsvib_torch.io.video import VideoReader, check_video, write_video
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.text import quoted
 
 
-# Contract of a format. All functions are called with the path of the stack; ``write`` with that of a temporary file or
-# folder, which the caller renames when it is complete (``rsvib_torch/files/atomic.py``).
-#
-# Shapes:      frames are (H, W) or (C, H, W), channels RGB or RGBA; ``StackInfo.shape`` is (T, H, W) or (T, C, H, W),
-#              also if the file stores channels last (``StackInfo.from_stored``, ``to_stored``).
-# Data types:  one of ``dtypes`` in native byte order; pixels are returned as stored, without scaling.
-# Full scale:  ``info.full_scale`` is the count that corresponds to 1.0, or None if the file does not state it; formats
-#              that have room for it store it (``known_full_scale`` supplies 255 for uint8).
-# Frame times: exposure starts in seconds, or None; times that are not exact need ``time_error`` and ``time_source``.
-# Orientation: frames have the rows and columns of the file; ``info.orientation`` states how they are displayed.
-# Metadata:    ``keeps`` states what the format stores besides pixels; users are told what their file loses.
-# Reading:     ``open`` must not allocate memory by sizes in a header before it has compared them with the size of the
-#              file, must not decode pixels, execute code or follow links to other files, and raises an ``OSError`` if
-#              the file cannot be opened, a one-line ``ValueError`` that names the file if it is not a stack
-#              (``readable_stack``), and ``ModuleNotFoundError`` if a package is missing (``needed_package``). A reader
-#              raises ``FrameError`` for a damaged frame (``readable_frame``); opening fails if more than half of the
-#              frames are missing. Frames that are stored together are decoded once (``io/blocks.py``);
-#              ``info.decoding_bytes`` is the memory that this needs.
-# Writing:     ``write`` takes the frames one after another; the caller synchronises the files with the disk.
 @dataclass(frozen=True)
 class StackFormat:
-    """How stacks are stored in files with certain endings."""
+    """How stacks are stored in files with certain endings; docs/stacks.md, "Other formats", has the contract."""
 
     name: str  # in messages
     endings: tuple[str, ...]  # lower case with the dot; ``""`` is a name without an ending
@@ -56,69 +36,28 @@ class StackFormat:
     keeps: tuple[str, ...] = ()  # attributes of ``StackInfo`` that are stored besides the pixels
 
 
-def packaged_format(
-    name: str,
-    endings: tuple[str, ...],
-    module: str,
-    open: str,
-    *,
-    write: str | None = None,
-    check: str | None = None,
-    **stated: Any,
-) -> StackFormat:
-    """A format whose functions are imported when they are called: reading a TIFF file imports no other format.
-
-    ``open``, ``write`` and ``check`` name functions of ``StackFormat`` in the ``module``. ``tests/test_imports.py``
-    reads these calls as imports.
-    """
-    functions: Table = {use: partial(_call, module, f) for use, f in (("write", write), ("check", check)) if f}
-    return StackFormat(name, endings, partial(_call, module, open), **functions, **stated)
-
-
-def _call(module: str, function: str, *arguments: Any) -> Any:
-    return getattr(import_module(module), function)(*arguments)
-
-
 _KEPT = ("full_scale", "frame_times", "orientation", "resolution")
 _KEPT_BY_PNG = ("full_scale", "orientation", "resolution")
 _KEPT_BY_VIDEO = ("full_scale", "frame_times", "orientation")
 
 # The order is that of error messages.
 _FORMATS_OF_THE_PACKAGE = (
-    packaged_format("npy", (".npy",), "rsvib_torch.io.flat_files", "open_npy", write="write_npy", check="check_npy"),
-    packaged_format(
-        "hdf5", (".h5", ".hdf5", ".hdf"), "rsvib_torch.io.hdf5", "open_hdf5", write="write_hdf5", keeps=_KEPT
+    StackFormat("npy", (".npy",), open_npy, write_npy, check=check_npy),
+    StackFormat("hdf5", (".h5", ".hdf5", ".hdf"), open_hdf5, write_hdf5, keeps=_KEPT),
+    StackFormat("jpeg", (".jpg", ".jpeg"), open_images),
+    StackFormat("png", (".png",), open_images, write_images, ("uint8", "uint16"), check_images, keeps=_KEPT_BY_PNG),
+    StackFormat(
+        "image folder", ("",), open_images, write_images, check=check_images, kind="folder", keeps=_KEPT_BY_PNG
     ),
-    packaged_format("jpeg", (".jpg", ".jpeg"), "rsvib_torch.io.images", "open_images"),
-    packaged_format(
-        "png", (".png",), "rsvib_torch.io.images", "open_images", write="write_images", check="check_images",
-        dtypes=("uint8", "uint16"), keeps=_KEPT_BY_PNG,
+    StackFormat("raw", (".raw",), open_raw, write_raw, companions=(".json",), keeps=_KEPT),
+    StackFormat(
+        "tiff", (".tif", ".tiff"), open_tiff, write_tiff, compressions=("zlib", "lzma"), keeps=(*_KEPT, "metadata")
     ),
-    packaged_format(
-        "image folder", ("",), "rsvib_torch.io.images", "open_images", write="write_images",
-        check="check_images", kind="folder", keeps=_KEPT_BY_PNG,
-    ),
-    packaged_format(
-        "raw", (".raw",), "rsvib_torch.io.flat_files", "open_raw", write="write_raw", companions=(".json",), keeps=_KEPT
-    ),
-    packaged_format(
-        "tiff", (".tif", ".tiff"), "rsvib_torch.io.tiff", "open_tiff", write="write_tiff",
-        compressions=("zlib", "lzma"), keeps=(*_KEPT, "metadata"),
-    ),
-    packaged_format(
-        "FFV1 video", FFV1, "rsvib_torch.io.video", "VideoReader", write="write_video",
-        check="check_video", dtypes=("uint8", "uint16"), keeps=_KEPT_BY_VIDEO,
-    ),
-    packaged_format(
-        "H.264 video", H264, "rsvib_torch.io.video", "VideoReader", write="write_video",
-        check="check_video", keeps=_KEPT_BY_VIDEO,
-    ),
-    packaged_format("avi, webm, mpeg, 3gp and wmv", READ_ONLY_VIDEO, "rsvib_torch.io.video", "VideoReader"),
-    packaged_format(
-        "zarr", (".zarr",), "rsvib_torch.io.zarr_store", "open_zarr", write="write_zarr", kind="tree",
-        marker="zarr.json", keeps=_KEPT,
-    ),
-)  # fmt: skip
+    StackFormat("FFV1 video", FFV1, VideoReader, write_video, ("uint8", "uint16"), check_video, keeps=_KEPT_BY_VIDEO),
+    StackFormat("H.264 video", H264, VideoReader, write_video, check=check_video, keeps=_KEPT_BY_VIDEO),
+    StackFormat("avi, webm, mpeg, 3gp and wmv", READ_ONLY_VIDEO, VideoReader),
+    StackFormat("zarr", (".zarr",), open_zarr, write_zarr, kind="tree", marker="zarr.json", keeps=_KEPT),
+)
 FORMATS: dict[str, StackFormat] = {ending: form for form in _FORMATS_OF_THE_PACKAGE for ending in form.endings}
 """Format of every file ending."""
 

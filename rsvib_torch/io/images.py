@@ -178,7 +178,7 @@ def open_images(path: Path) -> BlockReader:
     of_files = [info.metadata for info in infos if info is not None]
     metadata: dict[str, Tag | None] = {}
     for name in dict.fromkeys(chain.from_iterable(of_files)):
-        same = all(name in tags and tags[name] == of_files[0].get(name) for tags in of_files)
+        same = len({repr(tags.get(name, DIFFERENT)) for tags in of_files}) == 1  # arrays have no single equality
         metadata |= {name: of_files[0][name]} if same else {f"{name}{DIFFERENT}": None}
     stack = replace(first[0], frame_times=None, metadata=metadata).with_frames(len(files))
     if path.is_dir() and first[1].suffix.lower() in _TIFF:

@@ -106,19 +106,17 @@ def times_of_attributes(attributes: Mapping[str, Any], count: int) -> Table:
 
 def attributes_of(info: StackInfo) -> Table:
     """Attributes of an HDF5 dataset or Zarr array that state ``info``; unknown values are omitted."""
-    attributes: Table = {"axes": info.stored_axes}
-    if info.full_scale is not None:
-        attributes["full_scale"] = float(info.full_scale)
-    if info.frame_times is not None:
-        attributes["frame_times"] = [float(time) for time in info.frame_times]
-    elif info.frame_rate is not None:
-        attributes["frame_rate"] = float(info.frame_rate)
-    if info.orientation != 1:
-        attributes["orientation"] = info.orientation
-    if info.resolution is not None:
-        attributes["resolution"] = [float(value) for value in info.resolution[:2]]
-        attributes["resolution_unit"] = info.resolution[2]
-    return attributes
+    times, resolution = info.frame_times, info.resolution
+    stated: Table = {
+        "axes": info.stored_axes,
+        "full_scale": None if info.full_scale is None else float(info.full_scale),
+        "frame_times": None if times is None else [float(time) for time in times],
+        "frame_rate": None if times is not None or info.frame_rate is None else float(info.frame_rate),
+        "orientation": None if info.orientation == 1 else info.orientation,
+        "resolution": None if resolution is None else [float(value) for value in resolution[:2]],
+        "resolution_unit": None if resolution is None else resolution[2],
+    }
+    return {name: value for name, value in stated.items() if value is not None}
 
 
 def info_from_attributes(attributes: Mapping[str, Any], shape: tuple[int, ...], dtype: np.dtype) -> StackInfo:
@@ -230,24 +228,17 @@ def tiff_times(tif: tifffile.TiffFile, count: int, metadata: Mapping[str, Any]) 
     if "frame_rate" in metadata:
         return {"frame_rate": float(metadata["frame_rate"]), "time_source": "frame_rate"}
     with suppress(Exception):  # damaged metadata raise errors of many types
-        return _times_of_other_programs(tif, count)
+        if tif.ome_metadata:
+            return _ome_fields(tif.ome_metadata, count)
+        imagej = tif.imagej_metadata or {}
+        interval, unit = imagej.get("finterval"), _SECONDS.get(str(imagej.get("tunit", "s")).lower())
+        if isinstance(interval, int | float) and interval > 0:
+            return {"frame_rate": 1.0 / (unit * interval), "time_source": "ImageJ finterval"} if unit else {}
+        if len(tif.pages) == count and (first := _page_times(tif.pages.first)):
+            pages = (_page_times(cast("tifffile.TiffPage", tif.pages.get(n, aspage=True))) for n in range(count))
+            source = next(iter(first))
+            return _time_fields((page.get(source) for page in pages), count, _SOFTWARE_CLOCK_ERROR, source)
     return {}
-
-
-def _times_of_other_programs(tif: tifffile.TiffFile, count: int) -> Table:
-    if tif.ome_metadata:
-        return _ome_fields(tif.ome_metadata, count)
-    imagej = tif.imagej_metadata or {}
-    interval = imagej.get("finterval")
-    if isinstance(interval, int | float) and interval > 0:
-        unit = _SECONDS.get(str(imagej.get("tunit", "s")).lower())
-        return {"frame_rate": 1.0 / (unit * interval), "time_source": "ImageJ finterval"} if unit else {}
-    first = _page_times(tif.pages.first)
-    if len(tif.pages) != count or not first:
-        return {}
-    pages = (_page_times(cast("tifffile.TiffPage", tif.pages.get(number, aspage=True))) for number in range(count))
-    source = next(iter(first))
-    return _time_fields((page.get(source) for page in pages), count, _SOFTWARE_CLOCK_ERROR, source)
 
 
 def _page_times(page: tifffile.TiffPage) -> dict[str, float]:

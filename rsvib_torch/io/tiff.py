@@ -6,8 +6,9 @@ those that are not are named, so that the user learns what is lost.
 
 import json
 import math
-import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import re
+import warnings
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -118,119 +119,88 @@ def _info(
     return replace(info, metadata=_metadata(tif, info))
 
 
-def _page_reader(
-    path: Path,
-    info: StackInfo,
-    pages: Sequence[tifffile.TiffPage | tifffile.TiffFrame | None],
-    of_frames: Sequence[Sequence[int]],
-    close: Callable[[], None],
-) -> BlockReader:
-    """Reader of the frames that consist of the ``pages`` with the numbers ``of_frames``, one or one of each channel."""
-    size = path.stat().st_size
-
-    def read(first: int, _: int) -> Array:
-        of_frame = [pages[number] for number in of_frames[first]]
-        if not all(_is_complete(page, size) for page in of_frame):
-            raise FrameError(f"{path}: truncated: pixels of frame {first} lie beyond the end of the file")
-        stored = np.stack([page.asarray(maxworkers=1) for page in of_frame if page is not None])
-        return (np.moveaxis(stored, -1, 1) if info.channels_last else stored).reshape(1, *info.shape[1:])
-
-    return BlockReader(path, info, read, close=close)
-
-
-def _open_pages(path: Path, tif: tifffile.TiffFile, pages: Sequence[_Page]) -> BlockReader:
-    """Reader of a file in which every page is a frame, thumbnails and masks excepted."""
-    frames = [page for page in pages if not page.secondary] or pages
-    first = cast(tifffile.TiffPage, tif.pages[frames[0].number])
-    if first.dtype is None or first.axes not in ("YX", "YXS", "SYX"):
-        raise ValueError(f"page {first.index} has shape {first.shape} (axes {first.axes}); expected an image")
-    for page in frames:
-        if page.kind != frames[0].kind:
-            kinds = f"page {page.number} is {page.kind}, page {first.index} is {frames[0].kind}"
-            raise ValueError(f"frames of different size or kind: {kinds}")
-    _check_complete([page.complete for page in frames], sum(page.nbytes for page in frames), path.stat().st_size)
-    last, shape = first.axes == "YXS", _with_channels_first(first.shape, first.axes)
-    info = _info(tif, (len(frames), *shape), first.dtype, first.photometric, channels_last=last)
-    lost = {"thumbnails and masks": None} if len(frames) < len(pages) else {}
-    info = replace(info, metadata={**info.metadata, **lost})
-    return _page_reader(path, info, tif.pages, [[page.number] for page in frames], tif.close)
-
-
-def _open_series(path: Path, tif: tifffile.TiffFile) -> BlockReader:
-    """Reader of a file whose pages are arranged as one array."""
-    series = (tif.series() if callable(tif.series) else tif.series)[0]  # a method from tifffile 2026.5.2 on
-    # 1. The stack: an axis of frames, one of channels, and the image; axes of length 1 mean nothing.
-    sizes = [(axis, size) for axis, size in zip(series.axes, series.shape, strict=True) if size > 1 or axis in "YX"]
-    axes, shape = "".join(axis for axis, _ in sizes), tuple(size for _, size in sizes)
-    channels = [place for place, axis in enumerate(axes) if axis in "SC"]
-    times = [place for place, axis in enumerate(axes) if axis not in "SCYX"]
-    last = axes.endswith(("YXS", "YXC"))
-    if len(channels) > 1 or len(times) > 1 or "YX" not in axes:
-        raise ValueError(f"axes {axes} of sizes {shape}; expected one axis of frames, one of channels, and YX")
-    order = [*times, *channels, axes.index("Y"), axes.index("X")]
-    stack = tuple(shape[place] for place in order) if times else (1, *(shape[place] for place in order))
-    info = _info(tif, stack, series.dtype, series.keyframe.photometric, channels_last=last)
-    # 2. Its frames: one after another, or in pages.
-    pages, T = series.pages, info.shape[0]
-    if series.dataoffset is not None and (order == sorted(order) or (last and times in ([], [0]))):
-        tif.close()
-        return contiguous_reader(path, info, series.dataoffset, series.dtype.newbyteorder(tif.byteorder))
-    size = path.stat().st_size
-    _check_complete([_is_complete(page, size) for page in pages], math.prod(shape) * series.dtype.itemsize, size)
-    over_pages = shape[: len(shape) - len(series.keyframe.shape)]
-    if math.prod(over_pages) != len(pages) or (times and times[0] >= len(over_pages)):
-        raise ValueError(f"axes {axes}: a page has several frames; expected one frame per page")
-    numbers = np.arange(len(pages)).reshape(over_pages)
-    of_frames = (np.moveaxis(numbers, times[0], 0) if times else numbers).reshape(T, -1).tolist()
-    return _page_reader(path, info, pages, of_frames, tif.close)
-
-
-def _check_one_page_per_frame(shape: tuple[int, ...], axes: str, pages: int) -> None:
-    """Raise a ``ValueError`` if an array of several pages, one of several in a file, has other axes than frames."""
-    if pages > 1 and (shape[0] != pages or axes[:1] in ("C", "S")):
-        raise ValueError(
-            f"it contains several arrays, of which the first has shape {tuple(shape)} (axes {axes or 'unknown'}); "
-            "expected one array, or one frame per page"
-        )
-
-
 # programs that state how the pages of a file are arranged, as tifffile names them
 _PROGRAMS = (
     "shaped lsm mmstack ome imagej ndtiff fluoview stk sis svs scn qpi ndpi bif avs eer philips scanimage nih mdgel"
 )
 
 
-def _are_arranged(tif: tifffile.TiffFile, count: int) -> bool:
-    """Whether the ``count`` pages of a file are arranged as one array; otherwise every page is a frame."""
-    metadata = _json_description(tif)
+def _series(tif: tifffile.TiffFile, count: int) -> tifffile.TiffPageSeries | None:
+    """The array as which the ``count`` pages of a file are arranged; None if every page is a frame."""
+    metadata, arrays = _json_description(tif), list[tuple[tuple[int, ...], str, int]]()
     if "shape" in metadata:  # series of pages that were written one by one would take quadratic time
         shape = tuple(metadata["shape"])
-        pages = math.prod(shape) // math.prod(tif.pages.first.shape)
-        if pages < count:
-            _check_one_page_per_frame(shape, metadata.get("axes", ""), pages)
-            return False
-    if not tif.flags & set(_PROGRAMS.split()):
-        return False  # the series of all pages takes 0.3 ms per page
-    tif.pages.useframes = count > 1
-    try:
-        series = tif.series
-    except RuntimeError:  # pages differ
-        return False
-    if len(series) == 1 and series[0].kind not in ("uniform", "generic"):
-        return True
-    for one in series:
-        _check_one_page_per_frame(one.shape, one.axes, len(one.pages))
-    return False
+        arrays.append((shape, metadata.get("axes", ""), math.prod(shape) // math.prod(tif.pages.first.shape)))
+    if not arrays or arrays[0][2] >= count:
+        if not tif.flags & set(_PROGRAMS.split()):
+            return None  # the series of all pages takes 0.3 ms per page
+        tif.pages.useframes = count > 1
+        try:
+            series = tif.series() if callable(tif.series) else tif.series  # a method from tifffile 2026.5.2 on
+        except RuntimeError:  # pages differ
+            return None
+        if len(series) == 1 and series[0].kind not in ("uniform", "generic"):
+            return series[0]
+        arrays = [(one.shape, one.axes, len(one.pages)) for one in series]
+    for shape, axes, pages in arrays:
+        if pages > 1 and (shape[0] != pages or axes[:1] in ("C", "S")):
+            raise ValueError(
+                f"it contains several arrays, of which the first has shape {tuple(shape)} (axes {axes or 'unknown'}); "
+                "expected one array, or one frame per page"
+            )
+    return None
 
 
 def open_tiff(path: Path) -> BlockReader:
     """Open a TIFF file of one or many pages."""
     with readable_stack(path, "TIFF"), ExitStack() as opened:
         tif = opened.enter_context(tifffile.TiffFile(path))
-        pages = _pages(tif)
-        reader = _open_series(path, tif) if _are_arranged(tif, len(pages)) else _open_pages(path, tif, pages)
-        opened.pop_all()
-        return reader
+        headers, size = _pages(tif), path.stat().st_size
+        series = _series(tif, len(headers))
+        # 1. The array of the file. Without an arrangement, every page is a frame, thumbnails and masks excepted.
+        pages, offset = (tif.pages, None) if series is None else (series.pages, series.dataoffset)
+        if series is None:
+            frames = [page for page in headers if not page.secondary] or headers
+            numbers, complete = [page.number for page in frames], [page.complete for page in frames]
+            first = cast(tifffile.TiffPage, pages[numbers[0]])
+            if first.dtype is None or first.axes not in ("YX", "YXS", "SYX"):
+                raise ValueError(f"page {first.index} has shape {first.shape} (axes {first.axes}); expected an image")
+            other = next((page for page in frames if page.kind != frames[0].kind), None)
+            if other is not None:
+                kinds = f"page {other.number} is {other.kind}, page {first.index} is {frames[0].kind}"
+                raise ValueError(f"frames of different size or kind: {kinds}")
+            axes, shape, dtype = f"T{first.axes}", (len(frames), *first.shape), first.dtype
+        else:
+            first, axes, shape, dtype = series.keyframe, series.axes, series.shape, series.dtype
+            numbers, complete = list(range(len(pages))), [_is_complete(page, size) for page in pages]
+        # 2. The stack: an axis of frames, one of channels, and the image; axes of length 1 mean nothing.
+        sizes = [(axis, size) for axis, size in zip(axes, shape, strict=True) if size > 1 or axis in "YX"]
+        axes, shape = "".join(axis for axis, _ in sizes), tuple(size for _, size in sizes)
+        order = re.fullmatch("(?P<time>[^SCYX])?([SC])?YX(?P<last>[SC])?", axes)
+        if order is None or (order[2] and order["last"]):
+            raise ValueError(f"axes {axes} of sizes {shape}; expected an axis of frames, one of channels, and YX")
+        stack = shape if order["time"] else (1, *shape)
+        stack = (stack[0], stack[3], *stack[1:3]) if order["last"] else stack
+        info = _info(tif, stack, dtype, first.photometric, channels_last=order["last"] is not None)
+        if series is None and len(numbers) < len(headers):
+            info = replace(info, metadata={**info.metadata, "thumbnails and masks": None})
+        # 3. Its frames: one after another, or in one or several pages.
+        if offset is not None:
+            return contiguous_reader(path, info, offset, dtype.newbyteorder(tif.byteorder))
+        _check_complete(complete, info.shape[0] * info.frame_bytes, size)
+        over_pages = shape[: len(shape) - len(first.shape)]
+        if math.prod(over_pages) != len(numbers) or (order["time"] and not over_pages):
+            raise ValueError(f"axes {axes}: a page has several frames; expected one frame per page")
+        of_frames = np.array(numbers).reshape(info.shape[0], -1).tolist()
+
+        def read(first: int, _: int) -> Array:
+            of_frame = [pages[number] for number in of_frames[first]]
+            if not all(_is_complete(page, size) for page in of_frame):
+                raise FrameError(f"{path}: truncated: pixels of frame {first} lie beyond the end of the file")
+            stored = np.stack([page.asarray(maxworkers=1) for page in of_frame if page is not None])
+            return (np.moveaxis(stored, -1, 1) if info.channels_last else stored).reshape(1, *info.shape[1:])
+
+        return BlockReader(path, info, read, close=opened.pop_all().close)
 
 
 # Metadata
@@ -240,7 +210,7 @@ _JSON = "JSON metadata"  # keys of the description that tifffile writes
 _RESOLUTION = "resolution"  # without a unit of length, which ImageJ states in the description
 # keys of that description for the reader only
 _LAYOUT_KEYS = ("shape", "axes", "truncated", "full_scale", "frame_times", "frame_rate")
-_IMAGEJ_KEY = "rsvib="  # line of an ImageJ description: ImageJ uses the last description, so that there is no other one
+_IMAGEJ_KEY = "rsvib"  # of JSON in an ImageJ description: ImageJ uses the last description, so there is no other one
 
 _OF_THE_FILE = (
     "DocumentName Make Model DateTime Artist HostComputer XMP Copyright ExposureTime FNumber IPTCNAA InterColorProfile "
@@ -263,9 +233,7 @@ _SUBIFDS = 330
 
 def _json_description(tif: tifffile.TiffFile) -> Table:
     """What tifffile or this package states in the description of the first page; empty if there is nothing."""
-    page = tif.pages.first
-    lines = [line for line in page.description.splitlines() if line.startswith(_IMAGEJ_KEY)]
-    return _parsed(page.shaped_description or (lines[0].removeprefix(_IMAGEJ_KEY) if lines else ""))
+    return _parsed(tif.pages.first.shaped_description or str((tif.imagej_metadata or {}).get(_IMAGEJ_KEY, "")))
 
 
 def _parsed(text: str) -> Table:
@@ -280,27 +248,47 @@ def _metadata(tif: tifffile.TiffFile, info: StackInfo) -> dict[str, Tag | None]:
 
     Descriptions of the arrangement of its pages (OME, ImageJ) are copied only if those of the output will be the same.
     """
+    first = tif.pages.first
     numbers = sorted({1, len(tif.pages) - 1})  # a sample: values differ in all pages or in none
     others = [cast(tifffile.TiffPage, tif.pages.get(number)) for number in numbers if 0 < number < len(tif.pages)]
     found: dict[str, Tag | None] = {}
-    for tag in tif.pages.first.tags:
-        private = tag.code >= _FIRST_PRIVATE and tag.code not in _STORAGE
-        if tag.code == _DESCRIPTION or not (tag.code in _COPIED or private or tag.code == _SUBIFDS):
-            continue
-        name = tag.name if not tag.name.isdecimal() else f"tag {tag.name}"
-        values = [_value(page.tags.get(tag.code)) for page in (tif.pages.first, *others)]
-        if tag.code not in _COPIED or values[0] is None:
-            found[name] = None
-        elif any(value not in (None, values[0]) for value in values[1:]):
+
+    def add(name: str, values: Sequence[Any], code: int, dtype: int, count: int, scope: Scope) -> None:
+        """Add the values of the first page and of the others, in which they may be missing."""
+        if any(value not in (None, values[0]) for value in values[1:]):
             found[f"{name} (differs between pages)"] = None
         else:
-            found[name] = Tag(tag.code, int(tag.dtype), tag.count, values[0], None in values[1:], _COPIED[tag.code])
-    x, y, unit = (_value(tif.pages.first.tags.get(code)) for code in (282, 283, 296))
+            once = code == _DESCRIPTION or None in values[1:]
+            found[name] = None if values[0] is None else Tag(code, dtype, count, values[0], once, scope)
+
+    for tag in first.tags:
+        name = tag.name if not tag.name.isdecimal() else f"tag {tag.name}"
+        if tag.code in _COPIED:
+            values = [_value(page.tags.get(tag.code)) for page in (first, *others)]
+            add(name, values, tag.code, int(tag.dtype), tag.count, _COPIED[tag.code])
+        elif (tag.code >= _FIRST_PRIVATE and tag.code not in _STORAGE) or tag.code == _SUBIFDS:
+            found[name] = None
+    x, y, unit = (_value(first.tags.get(code)) for code in (282, 283, 296))
     rational = all(isinstance(scale, tuple) and len(scale) == 2 and min(scale) > 0 for scale in (x, y))
     if rational and unit == 1 and (x, y) != ((1, 1), (1, 1)):
         found[_RESOLUTION] = Tag(282, 5, 2, (x, y), False, "image")
-    same_pages = info.axes == "THW" or (info.channels_last and info.shape[1] in (3, 4))
-    return found | _descriptions(tif, others, info.shape[0] if same_pages else -1)
+    # Descriptions of all pages together are valid if the same pages will be written.
+    same = info.axes == "THW" or (info.channels_last and info.shape[1] in (3, 4))
+    stated, text = [_stated(page) for page in (first, *others)], _free_text(first)
+    if stated[0]:
+        add(_JSON, stated, _DESCRIPTION, 2, 0, "file")
+    imagej = dict(tif.imagej_metadata or {})
+    if imagej:
+        imagej.pop(_IMAGEJ_KEY, None)
+        imagej["axes"] = f"{'Z' if 'slices' in imagej else 'T'}YX" + "S" * (first.axes == "YXS")
+        dtypes = ("uint8", "uint16", "int16", "float32") if info.axes == "THW" else ("uint8",)  # of ImageJ
+        add("ImageJ metadata", [imagej if same and info.dtype in dtypes else None], _IMAGEJ, 1, 0, "stack")
+    elif first.is_ome:
+        single = same and info.shape[0] == len(tif.pages) and "FileName=" not in text
+        add("OME-XML", [text if single else None], _DESCRIPTION, 2, 0, "stack")
+    elif text:
+        add("ImageDescription", [text, *(_free_text(page) or None for page in others)], _DESCRIPTION, 2, 0, "file")
+    return found
 
 
 def _value(tag: tifffile.TiffTag | None) -> Any:
@@ -312,42 +300,17 @@ def _value(tag: tifffile.TiffTag | None) -> Any:
     return value if all(isinstance(part, (int, float, str, bytes)) for part in parts) else None
 
 
-def _descriptions(tif: tifffile.TiffFile, others: Sequence[tifffile.TiffPage], frames: int) -> dict[str, Tag | None]:
-    """Descriptions of the first page; ``frames`` of the file that will be written as the same pages."""
-    first = tif.pages.first
-    found: dict[str, Tag | None] = {}
-    written = {key: value for key, value in _parsed(first.shaped_description or "").items() if key not in _LAYOUT_KEYS}
-    if written:
-        alike = all(_parsed(page.shaped_description or "").items() >= written.items() for page in others)
-        alike |= all(not page.shaped_description for page in others)
-        name = _JSON if alike else f"{_JSON} (differs between pages)"
-        found[name] = _text(json.dumps(written), "file") if alike else None
-    text = _free_text(first)
-    if first.is_imagej:
-        kept = "".join(f"{line}\n" for line in text.splitlines() if not line.startswith(_IMAGEJ_KEY))
-        found["ImageJ metadata"] = _text(kept, "stack") if frames > 0 else None
-        if _IMAGEJ in first.tags:
-            values = first.tags[_IMAGEJ].value
-            known = frames > 0 and isinstance(values, dict)
-            found["ImageJ overlays and labels"] = Tag(_IMAGEJ, 1, 0, values, True, "stack") if known else None
-    elif first.is_ome:
-        single = frames == len(tif.pages) and "FileName=" not in text
-        found["OME-XML"] = _text(text, "stack") if single else None
-    elif text and any(_free_text(page) not in ("", text) for page in others):
-        found["ImageDescription (differs between pages)"] = None
-    elif text:
-        found["ImageDescription"] = _text(text, "file")
-    return found
+def _stated(page: tifffile.TiffPage) -> str | None:
+    """What the JSON description of a page states besides the layout; None if there is nothing."""
+    parsed = _parsed(page.shaped_description or "")
+    stated = {key: parsed[key] for key in sorted(parsed) if key not in _LAYOUT_KEYS}
+    return json.dumps(stated) if stated else None
 
 
 def _free_text(page: tifffile.TiffPage) -> str:
     """The description of a page that is not that of tifffile."""
     texts = (page.description, page.description1)
     return next((text for text in texts if text and text != page.shaped_description), "")
-
-
-def _text(text: str, scope: Scope) -> Tag:
-    return Tag(_DESCRIPTION, 2, 0, text, True, scope)
 
 
 def _writer_options(info: StackInfo, description: Mapping[str, object]) -> Table:
@@ -362,16 +325,13 @@ def _writer_options(info: StackInfo, description: Mapping[str, object]) -> Table
         elif name == _RESOLUTION:
             options.update(resolution=tag.value, resolutionunit="NONE")
         elif tag.code == _IMAGEJ:
-            extratags += tifffile.imagej_metadata_tag(tag.value, "<" if sys.byteorder == "little" else ">")
+            own = {key: value for key, value in description.items() if key != "axes"}
+            options.update(imagej=True, metadata={**tag.value, **({_IMAGEJ_KEY: json.dumps(own)} if own else {})})
         elif tag.code == _DESCRIPTION:
             options["description"] = tag.value.encode()
         else:
             value = tag.value.encode() if isinstance(tag.value, str) else tag.value
             extratags.append((tag.code, tag.dtype, tag.count, value, tag.first_page))
-    if info.metadata.get("ImageJ metadata") is not None:
-        values = {key: value for key, value in description.items() if key != "axes"}
-        line = f"{_IMAGEJ_KEY}{json.dumps(values)}\n" if values else ""
-        options.update(metadata=None, description=options["description"] + line.encode())
     return options
 
 
@@ -416,4 +376,6 @@ def write_tiff(
         pages = (plane for frame in pages for plane in frame)
     # an iterator would have to yield the tiles
     data = np.stack(list(pages)).reshape(stored.stored_shape) if "tile" in storage else pages
-    tifffile.imwrite(path, data=data, maxworkers=1, **{"compression": compression, **storage, **options})
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".* truncating ImageJ file")  # from 4 GB on, as ImageJ does: only one header
+        tifffile.imwrite(path, data=data, maxworkers=1, **{"compression": compression, **storage, **options})

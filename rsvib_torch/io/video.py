@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
 from io import BytesIO
-from itertools import chain, count, pairwise
+from itertools import chain, count, islice, pairwise, repeat
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -216,16 +216,24 @@ class VideoReader:
     """Frames of a video, decoded in sequence; reading an earlier frame starts again at the beginning."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self._path, self._next = path, 0
         self.info, self._times, self.picture = scanned(path)
-        self._container: Any = None
-        self._early: av.VideoFrame | None = None  # a decoded frame, if those before it cannot be decoded
-        self._restart()
+        self._presented = self._in_order()
 
-    def _restart(self) -> None:
-        self.close()
-        self._container, self._next = open_container(self._path), 0
-        self._decoding, self._early = _frames(self._container), None
+    def _in_order(self) -> Generator[av.VideoFrame | None, None, None]:
+        """The frames in their order, each at its presentation time if they are known; None if it cannot be decoded."""
+        with open_container(self._path) as container, closing(_frames(container)) as decoded:
+            frame = next(decoded, None)
+            for expected in self._times or repeat(None, self.info.shape[0]):
+                time = None if frame is None or expected is None else _time_of(frame, frame)
+                while time is not None and expected is not None and time < expected:
+                    frame = next(decoded, None)
+                    time = None if frame is None else _time_of(frame, frame)
+                if time is not None and expected is not None and time > expected:
+                    yield None
+                else:
+                    yield frame
+                    frame = next(decoded, None)
 
     def frame(self, index: int) -> Array:
         """Pixels of a frame as stored."""
@@ -241,11 +249,10 @@ class VideoReader:
 
     def _decoded(self, index: int) -> av.VideoFrame:
         if index < self._next:
-            self._restart()
-        frame = None
-        while self._next <= index:
-            frame = self._decode(self._times[self._next] if self._times else None)
-            self._next += 1
+            self._presented.close()
+            self._presented, self._next = self._in_order(), 0
+        frame = next(islice(self._presented, index - self._next, None), None)
+        self._next = index + 1
         if frame is None:
             raise FrameError(f"{self._path}: frame {index} cannot be decoded")
         if frame.is_corrupt:
@@ -254,23 +261,9 @@ class VideoReader:
             raise FrameError(f"{self._path}: frames of different size: frame {index} is {frame.height, frame.width}")
         return frame
 
-    def _decode(self, expected: Fraction | None) -> av.VideoFrame | None:
-        """The frame of an expected presentation time in s; None if it cannot be decoded."""
-        while True:
-            frame, self._early = self._early or next(self._decoding, None), None
-            time = None if frame is None or expected is None else _time_of(frame, frame)
-            if time is None or expected is None or time == expected:
-                return frame
-            if time > expected:
-                self._early = frame
-                return None
-
     def close(self) -> None:
         """Close the file."""
-        if self._container is not None:
-            self._decoding.close()
-            self._container.close()
-            self._container = None
+        self._presented.close()
 
 
 def _source(info: StackInfo) -> Path | None:

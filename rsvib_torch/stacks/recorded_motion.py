@@ -14,10 +14,9 @@ from torch import Tensor
 
 from rsvib_torch.checks.values import refused
 from rsvib_torch.files.reading import Table
-from rsvib_torch.gyroscope.alignment import ClockAlignment, FittedClock, align_motion
+from rsvib_torch.gyroscope.alignment import ClockAlignment, FittedClock, MotionCheck, align_motion, check_motion
 from rsvib_torch.gyroscope.corner_tracks import corner_tracks
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
-from rsvib_torch.gyroscope.motion_check import MotionCheck, check_motion
 from rsvib_torch.gyroscope.rotation_alignment import RotationAlignment, align_rates, offset_range, outside
 from rsvib_torch.io.frame_times import timing_from_first_frame
 from rsvib_torch.io.full_scale import counts_to_frames

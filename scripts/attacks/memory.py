@@ -38,7 +38,6 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path, Counts], None]]] = {
     "TIFF, pages, zlib": ("b.tif", partial(write_tiff, metadata={}, compression="zlib")),
     "TIFF, tiled, zlib": ("c.tif", partial(write_tiff, metadata={}, compression="zlib", tile=(64, 64))),
     "npy, C order": ("f.npy", np.save),
-    "npy, Fortran order": ("g.npy", lambda path, counts: np.save(path, np.asfortranarray(counts))),
     "HDF5, contiguous": ("h.h5", write_hdf5),
     "HDF5, chunk per frame": ("i.h5", partial(write_hdf5, chunks=_FRAME, compression="gzip")),
     "HDF5, one chunk": ("j.h5", partial(write_hdf5, chunks=_STACK, compression="gzip", compression_opts=1)),

@@ -49,7 +49,7 @@ def test_tiff_truncated_anywhere_is_refused(tmp_path, kind):
     [
         ((9, 7), "uint8", {"photometric": "miniswhite"}, "MINISWHITE"),
         ((9, 8), "bool", {}, "pixels are bool"),
-        ((2, 5, 9, 7), "uint8", {"metadata": {"axes": "TZYX"}}, "one axis of frames"),
+        ((2, 5, 9, 7), "uint8", {"metadata": {"axes": "TZYX"}}, "an axis of frames"),
     ],
 )
 def test_tiff_files_that_are_not_stacks_are_refused(tmp_path, shape, dtype, options, message):
@@ -91,6 +91,8 @@ def test_npy_damage_is_refused(tmp_path):
     refuses(lambda: read_stack_info(path), "truncated: the header states")
     np.save(path, np.array([{"a": 1}], dtype=object), allow_pickle=True)
     refuses(lambda: read_stack(path), "pixels are object")
+    np.save(path, np.asfortranarray(np.zeros((3, 9, 7), np.uint8)))
+    refuses(lambda: read_stack(path), r"store np\.ascontiguousarray\(frames\)")
     for shape, message in (
         ((5,), "expected"),
         ((2, 9, 7, 3), r"channels last; store \(T, C, H, W\)"),

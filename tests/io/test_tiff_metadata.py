@@ -171,10 +171,18 @@ def test_imagej_metadata_are_kept(tmp_path, byteorder, compression):
         assert rest == given.imagej_metadata
         assert (rest["Labels"], rest["Info"]) == (own["Labels"], own["Info"])
         assert all(found.pages[0].tags[name].value == given.pages[0].tags[name].value for name in ("XResolution", 296))
-    lost = ("ImageJ metadata", "ImageJ overlays and labels")
-    assert copied(tmp_path, change=lambda frames: frames[:2]) == lost
+    assert copied(tmp_path, change=lambda frames: frames[:2]) == ("ImageJ metadata",)
     assert not header(tmp_path / "out.tif", "is_imagej")
-    assert copied(tmp_path, output="out.npy") == ("resolution", *lost)
+    assert copied(tmp_path, output="out.npy") == ("resolution", "ImageJ metadata")
+
+
+def test_a_folder_of_imagej_files_with_colours_of_their_own(tmp_path):
+    (tmp_path / "in").mkdir()
+    for index, frame in enumerate(COLOUR[:2, ..., 0]):
+        own = {"LUTs": [np.stack([np.arange(256, dtype=np.uint8)] * 3)], "Ranges": (0.0, 200.0), "mode": "composite"}
+        tifffile.imwrite(tmp_path / "in" / f"{index}.tif", frame, imagej=True, metadata=own)
+    write_stack(tmp_path / "out", read_stack(tmp_path / "in"), dtype="uint8", like=read_stack_info(tmp_path / "in"))
+    assert header(tmp_path / "out" / "1.tif", "imagej_metadata")["Ranges"] == (0.0, 200.0)
 
 
 def test_ome_xml_is_kept(tmp_path):
