@@ -1,4 +1,4 @@
-"""Stacks of any length, processed window by window: windows, engines, journal and resume, manifest, memory planning."""
+"""Stacks of any length, processed window by window: windows, engines, runs and their resumption, manifest, memory planning."""
 
 import lazy_loader
 

@@ -46,11 +46,13 @@ def _compute_on_worker(job: StackJob, window: Window, one_thread: bool) -> Store
     if one_thread:
         torch.set_num_threads(1)
     try:
-        if job.device.startswith("cuda"):  # workers with a number as their name use the GPUs in turn
+        device = job.options.device
+        if device.startswith("cuda"):  # workers with a number as their name use the GPUs in turn
             count, name = torch.cuda.device_count(), _distributed().get_worker().name
             if count == 0:
                 raise RuntimeError("this worker has no CUDA device; use device='cpu'")
-            job = replace(job, device=f"cuda:{int(name) % count}" if str(name).isdecimal() else "cuda:0")
+            device = f"cuda:{int(name) % count}" if str(name).isdecimal() else "cuda:0"
+            job = replace(job, options=replace(job.options, device=device))
         with closing(read_windows(job, [window])) as read:
             _, pixels = next(read)
         return job.stored(job.compute(window, pixels), pixels)

@@ -1,10 +1,10 @@
 """A run that writes an output from windows, and is resumed if it was interrupted.
 
-Finished windows are in a folder beside the output. A window consists of files of pixels and a line of the journal, with
-its record and the hashes of its files. The line is written when the files and their names are on the disk, so that a
-window with a line is finished. Every line begins with a hash of itself and of the line before: a journal that somebody
-has edited is refused. Files are opened relative to the open folder, and only new files are written: a link in the place
-of the folder or of a file is never followed, and nothing that others made is changed.
+Finished windows are in a folder beside the output: files of pixels, and a file with the record and the hashes of these
+files, which is written when they are on the disk. It begins with a hash of itself, whose key are the settings of the
+run: a window of another run, and one of which any file was changed, is not finished, and computed again. Files are
+opened relative to the open folder, and only new files are written: a link in the place of the folder or of a file is
+never followed, and nothing that others made is changed.
 """
 
 import errno
@@ -23,7 +23,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import IO, Literal
+from typing import IO, Any, Literal
 
 import numpy as np
 
@@ -42,8 +42,9 @@ from rsvib_torch.stacks.manifest import StackManifest, read_manifest, stack_mani
 from rsvib_torch.stacks.windows import WindowRecord
 from rsvib_torch.text import number_of, one_line
 
-_JOURNAL = "journal"
-_NAMES = re.compile(rf"{_JOURNAL}|\d{{6,}}\.(npy|mkv|mp4|mov|m4v)")  # of the files that a run makes
+_SETTINGS = "settings.json"
+_RECORD = re.compile(r"\d{6,}\.json")
+_NAMES = re.compile(rf"{re.escape(_SETTINGS)}|\d{{6,}}\.(json|npy|mkv|mp4|mov|m4v)")  # of the files that a run makes
 _SAFELY = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # opening a named pipe must not wait for another process
 _blake2b = partial(hashlib.blake2b, digest_size=16)
 
@@ -82,16 +83,14 @@ class RunFolder:
 
     def __init__(self, sink: Path, header: Mapping[str, object], *, resume: bool) -> None:
         self.sink, self.path, self._above = sink, work_folder(sink), nearest_folder(sink)
-        self._windows: dict[int, bytes] = {}  # finished: record and hashes of the files as JSON
-        self._digest = b""  # of the last line of the journal
+        self._finished: dict[int, tuple[WindowRecord, list[str]]] = {}  # record and names of the files of windows
+        self._key = _blake2b(json.dumps(header).encode()).digest()
         atomic.make_folder(self.path.parent)
         while not self._open():
             pass
         with ExitStack() as opened:
             opened.callback(os.close, self._folder)
-            names = self._checked_names()
-            self._journal = opened.enter_context(self._file(_JOURNAL, "a+b"))
-            self._read_journal(dict(header), names, resume=resume)
+            self._find_windows(header, resume=resume)
             self._opened = opened.pop_all()
 
     def _open(self) -> bool:
@@ -133,72 +132,54 @@ class RunFolder:
             f"delete {self.path} to start over"
         )
 
-    def _checked_names(self) -> list[str]:
-        """Names in the folder; a ``FileExistsError`` if there is anything in it that no run has made."""
+    def _find_windows(self, header: Mapping[str, object], *, resume: bool) -> None:
+        """Find the finished windows; an error if the folder has other files than those of a run, or of another run."""
         names = sorted(os.listdir(self._folder))
-        if names and _JOURNAL not in names:
-            raise self._refusal(f"it has no {_JOURNAL}")
         for name in names:
             status = os.stat(name, dir_fd=self._folder, follow_symlinks=False)
-            if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1 or status.st_uid != os.geteuid():
-                raise self._refusal("it is not a regular file of one name and of this user", name)
-            if not _NAMES.fullmatch(name):
-                raise self._refusal("it has another name than files of a run", name)
-        return names
+            if not (_NAMES.fullmatch(name) and stat.S_ISREG(status.st_mode)):
+                raise self._refusal("it has another name than files of a run, or is no regular file", name)
+        stored, records = self._content(_SETTINGS), list(filter(_RECORD.fullmatch, names))
+        if records and not resume:
+            raise FileExistsError(
+                f"{self.sink}: a run was interrupted here after {len(records)} windows; resume it (--resume), or "
+                f"delete {self.path} to start over"
+            )
+        difference = records and stored is not None and _difference(stored, dict(header))
+        if difference:
+            raise ValueError(f"{self.sink}: cannot resume: {difference}; delete {self.path} to start over")
+        for name in records:
+            entry = self._content(name, self._key)
+            with suppress(FileNotFoundError):
+                if entry is not None and all(self._digest(file) == digest for file, digest in entry["files"].items()):
+                    record = decode(WindowRecord, entry["record"], name)
+                    if name == _record_name(record.window):
+                        self._finished[record.window] = record, list(entry["files"])
+        if stored != header:
+            self._write(_SETTINGS, header)
 
-    def _file(self, name: str, mode: Literal["rb", "x+b", "a+b"]) -> IO[bytes]:
+    def _file(self, name: str, mode: Literal["rb", "x+b"]) -> IO[bytes]:
         """Open a file of the folder, wherever the folder is now, and never through a link."""
         return open(name, mode, opener=lambda name, flags: os.open(name, flags | _SAFELY, 0o600, dir_fd=self._folder))
 
-    def _read_journal(self, header: Table, names: Iterable[str], *, resume: bool) -> None:
-        """Find the windows whose files are as they were written; a journal without windows begins anew."""
-        start_over = f"delete {self.path} to start over"
-        damaged = ValueError(f"{self.path / _JOURNAL} is damaged; {start_over}")
-        stored, end = None, 0
-        self._journal.seek(0)
-        for line in self._journal:
-            if not line.endswith(b"\n") or b"\0" in line:  # it was not yet on the disk
-                break
-            digest, _, body = line[:-1].partition(b" ")
-            if digest != _keyed(body, self._digest):
-                raise damaged
-            if end == 0:
-                stored = json.loads(body)
-            else:
-                self._windows[json.loads(body)["record"]["window"]] = body
-            self._digest, end = digest, end + len(line)
-        if end == 0 and set(names) > {_JOURNAL}:
-            raise damaged
-        if not self._windows:
-            end, self._digest = 0, b""
-        elif not resume:
-            raise FileExistsError(
-                f"{self.sink}: a run was interrupted here after {self.count} windows; resume it (--resume), or "
-                f"{start_over}"
-            )
-        elif difference := _difference(stored, header):
-            raise ValueError(f"{self.sink}: cannot resume: {difference}; {start_over}")
-        self._journal.truncate(end)
-        if not self._windows:
-            self._append(header)
-            os.fsync(self._folder)
-        for window, body in list(self._windows.items()):
-            whole = False  # whether its files are those that were written
-            with suppress(OSError):
-                whole = all(self._digest_of(name) == digest for name, digest in json.loads(body)["files"].items())
-            if not whole:
-                del self._windows[window]
+    def _write(self, name: str, content: Mapping[str, object], key: bytes = b"") -> None:
+        """Write a table with its hash; it is on the disk when the function returns."""
+        body = json.dumps(content).encode()
+        with self.create(name) as file:
+            file.write(_blake2b(body, key=key).hexdigest().encode() + b" " + body)
+            file.flush()
+            os.fsync(file.fileno())
+        os.fsync(self._folder)
 
-    def _append(self, entry: Mapping[str, object]) -> bytes:
-        """Write a line of the journal, which is on the disk when the function returns, and return it as JSON."""
-        body = json.dumps(entry).encode()
-        self._digest = _keyed(body, self._digest)
-        self._journal.write(self._digest + b" " + body + b"\n")
-        self._journal.flush()
-        os.fsync(self._journal.fileno())
-        return body
+    def _content(self, name: str, key: bytes = b"") -> Any:
+        """The table in a file; None if the file is not as it was written, or with another key."""
+        with suppress(FileNotFoundError), self.open(name) as file:
+            digest, _, body = file.read().partition(b" ")
+            if digest == _blake2b(body, key=key).hexdigest().encode():
+                return json.loads(body)
+        return None
 
-    def _digest_of(self, name: str, *, synchronised: bool = False) -> str:
+    def _digest(self, name: str, *, synchronised: bool = False) -> str:
         with self.open(name) as file:
             if synchronised:
                 os.fsync(file.fileno())
@@ -226,33 +207,26 @@ class RunFolder:
                 with self.create(names[-1]) as file:
                     np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(array))
                     file.write(array.data)  # errors of np.save do not contain the reason
-            digests = {name: self._digest_of(name, synchronised=True) for name in names}
-            os.fsync(self._folder)  # their names
-            self._windows[record.window] = self._append({"record": plain_values(record), "files": digests})
+            digests = {name: self._digest(name, synchronised=True) for name in names}
+            content = {"record": plain_values(record), "files": digests}
+            self._write(_record_name(record.window), content, self._key)
+            self._finished[record.window] = record, names
 
     def __contains__(self, window: int) -> bool:
-        return window in self._windows
+        return window in self._finished
 
     @property
     def count(self) -> int:
         """Number of finished windows."""
-        return len(self._windows)
+        return len(self._finished)
 
-    @property
-    def written(self) -> int:
-        """Number of their frames."""
-        return sum(entry["record"]["written"] for entry in self._entries())
-
-    def _entries(self) -> Iterator[Table]:
-        return (json.loads(self._windows[window]) for window in sorted(self._windows))
-
-    def records(self) -> Iterator[WindowRecord]:
+    def records(self) -> list[WindowRecord]:
         """Records of the finished windows in order."""
-        return (decode(WindowRecord, entry["record"], _JOURNAL) for entry in self._entries())
+        return [self._finished[window][0] for window in sorted(self._finished)]
 
-    def files(self) -> Iterator[str]:
+    def files(self) -> list[str]:
         """Names of the files of the finished windows in order."""
-        return (name for entry in self._entries() for name in entry["files"])
+        return [name for window in sorted(self._finished) for name in self._finished[window][1]]
 
     def remove(self) -> None:
         """Remove the folder, and the empty folders above it that were created for it.
@@ -260,7 +234,7 @@ class RunFolder:
         It is renamed first: if the process is killed meanwhile, ``temporary_folder`` removes the rest later.
         """
         hidden = self.path.with_name(f".{self.sink.name}.{secrets.token_hex(4)}{atomic.PART}")
-        self._windows.clear()
+        self._finished.clear()
         if self._has_its_name():
             self.path.rename(hidden)
             sync(hidden.parent)
@@ -274,13 +248,12 @@ class RunFolder:
     def close(self) -> None:
         """Release the folder; it is removed if it contains no finished window."""
         with self._opened:
-            if not self._windows:
+            if not self._finished:
                 self.remove()
 
 
-def _keyed(body: bytes, key: bytes) -> bytes:
-    """Digest of a line of the journal; the key is that of the line before."""
-    return _blake2b(body, key=key).hexdigest().encode()
+def _record_name(window: int) -> str:
+    return f"{window:06d}.json"
 
 
 @contextmanager
@@ -365,6 +338,7 @@ def run_to_file(
     output from the folder.
     """
     start = time.perf_counter()
+    header = json.loads(json.dumps(header))  # lists instead of tuples, as in files
     path = sink.with_name(f"{sink.name}.manifest.json") if options.manifest is None else Path(options.manifest)
     check_outputs([*stack_files(sink), work_folder(sink), path], inputs)
 

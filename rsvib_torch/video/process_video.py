@@ -240,7 +240,7 @@ class _SecondPass:
     def run(self, at_once: int) -> None:
         """Restore a number of frames at the same time."""
         share_one_heap()
-        threads = 1 if self.video.frames.job.device == "cpu" else torch.get_num_threads()
+        threads = 1 if self.video.frames.job.options.device == "cpu" else torch.get_num_threads()
         with closing(in_threads(self._restored, self._missing(), at_once=at_once, threads=threads)) as frames:
             for part, of_part in groupby(frames, lambda one: one[0].index // PART_FRAMES):
                 self._encode(part, of_part)

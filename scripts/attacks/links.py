@@ -1,4 +1,4 @@
-"""Links, foreign files and devices in the place of the work folder and in it: nothing outside is changed."""
+"""Links, foreign files and devices in the place of the work folder: nothing outside is changed."""
 
 import os
 import random
@@ -6,38 +6,22 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
-from itertools import product
 from pathlib import Path
 from typing import Any
 
-from attacks.small_runs import FORMATS, Child, Reference, completed_or_refused, content, fork, kill_run, process, resume
+from attacks.small_runs import FORMATS, Child, Reference, completed_or_refused, content, fork, process
 from attacks.trial import Trial
 
 _LINKS = {"link to a folder": "", "link to a file": "precious.txt", "link to nothing": "missing"}
-_KINDS, _TARGETS = ("TIFF", "npy, frames skipped", "video"), ("journal", "000000.npy", "000004.npy", "out.tif")
 
 
 def _victim(folder: Path) -> Path:
     """A folder of the user, with files of the names that a run uses."""
     shutil.rmtree(folder, ignore_errors=True)
-    for name in ("precious.txt", "journal", "out.tif", "out/zarr.json", "000000.npy"):
+    for name in ("precious.txt", "settings.json", "out.tif", "out/zarr.json", "000000.npy"):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(b"precious\n")
     return folder
-
-
-def _linked(path: Path, victim: Path, kind: str) -> None:
-    """Replace a file or folder by a link to the victim's."""
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-        path.symlink_to(victim)
-        return
-    path.unlink(missing_ok=True)
-    path.parent.mkdir(exist_ok=True)
-    if kind == "hard link":
-        os.link(victim / "precious.txt", path)
-    else:
-        path.symlink_to(victim / "precious.txt")
 
 
 def _judged(title: str, victim: Path, before: dict[str, bytes], code: Any, result: Any, difference: str) -> Trial:
@@ -62,19 +46,6 @@ def _work_folder_is(kind: str, what: str, again: bool, place: Path, victim: Path
     resumed = {"resume": True} if again else {}
     code, result = fork(process, reference.source, place / name, **options, **resumed)
     return _judged(f"{kind}: work folder is a {what}", watched, before, code, result, "written nevertheless")
-
-
-def _is_link(
-    kind: str, target: str, link: str, choice: random.Random, place: Path, victim: Path, reference: Reference
-) -> Trial:
-    """A file or folder in the work folder is replaced by a link."""
-    name, options = FORMATS[kind]
-    kill_run(reference, place, kind, choice, windows=2)
-    before = content(_victim(victim))
-    _linked(place / f".{name}.rsvib" / target, victim, link)
-    code, result = fork(resume, reference.source, place / name, options)
-    difference = reference.difference(place, name) if code == 0 else ""
-    return _judged(f"{kind}: {target} is a {link}", victim, before, code, result, difference)
 
 
 def _replaced_meanwhile(moment: float, place: Path, victim: Path, reference: Reference) -> Trial:
@@ -105,7 +76,6 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
         for number, what in enumerate((*_LINKS, "file", "pipe", "folder of the user"))
         for kind in list(FORMATS)[number % 2 :: 2]
     ]
-    attacks += [partial(_is_link, *of, choice) for of in product(_KINDS, _TARGETS, ("link", "hard link"))]
     attacks += [partial(_replaced_meanwhile, choice.uniform(0.02, 0.4)) for _ in range(count - len(attacks))]
     for attack in attacks[:: max(1, len(attacks) // count)][:count]:
         place, victim = folder / "trial", folder / "victim"

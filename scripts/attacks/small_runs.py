@@ -230,10 +230,9 @@ def calls_of(reference: Reference, kind: str) -> int:
 
 
 def finished_windows(folder: Path, name: str) -> int:
-    """Number of windows of an interrupted run that have a complete line in the journal."""
-    journal = folder / f".{name}.rsvib" / "journal"
-    lines = journal.read_bytes().partition(b"\0")[0].count(b"\n") if journal.exists() else 0
-    return max(0, lines - 1)
+    """Number of windows of an interrupted run that have a complete record."""
+    records = (folder / f".{name}.rsvib").glob("0*.json")
+    return sum(path.read_bytes().endswith(b"}") and b"\0" not in path.read_bytes() for path in records)
 
 
 def kill_run(reference: Reference, folder: Path, kind: str, choice: random.Random, *, windows: int) -> None:
