@@ -152,6 +152,8 @@ def test_buffers_that_are_written_to_again_change_no_tracked_frame(buffers):
     results = []
     for index in range(24):
         buffer = memory[index % buffers].copy_(FRAMES[index % 4])
-        results.append([tracker.update(frame) for tracker, frame in zip(trackers, (FRAMES[index % 4], buffer), strict=True)])
+        results.append(
+            [tracker.update(frame) for tracker, frame in zip(trackers, (FRAMES[index % 4], buffer), strict=True)]
+        )
         buffer.fill_(0.5)
     assert all(torch.equal(of_copy.restored, of_buffer.restored) for of_copy, of_buffer in results)

@@ -335,8 +335,7 @@ def _given(
         return None if given is None else dict(enumerate(given))
     if options.detection or given is not None or not isinstance(motion, FreeMotion):
         raise ValueError("motion must be a FreeMotion; it has no detection, given detections or follow beside it")
-    starts = timing.frame_starts(info.shape[0])
-    starts = (starts - starts[0]).tolist()
+    starts: list[float] = (timing.frame_starts(info.shape[0]) - timing.frame_starts(1)).tolist()
     readout = info.shape[int(timing.scan_axis)] * timing.row_time + timing.exposure_time
     ends = [(starts[window.first], starts[window.last]) for window in windows]
     parts = [motion.within(first - readout, last + 2 * readout).retimed(first) for first, last in ends]

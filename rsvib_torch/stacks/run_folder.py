@@ -19,7 +19,7 @@ import stat
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -86,15 +86,6 @@ class RunFolder:
         self._finished: dict[int, tuple[WindowRecord, list[str]]] = {}  # record and names of the files of windows
         self._key = _blake2b(json.dumps(header).encode()).digest()
         atomic.make_folder(self.path.parent)
-        while not self._open():
-            pass
-        with ExitStack() as opened:
-            opened.callback(os.close, self._folder)
-            self._find_windows(header, resume=resume)
-            self._opened = opened.pop_all()
-
-    def _open(self) -> bool:
-        """Open the folder, which is created if it does not exist, and lock it; False if it was removed meanwhile."""
         with ExitStack() as opened:
             try:
                 with suppress(FileExistsError):
@@ -102,24 +93,29 @@ class RunFolder:
                     sync(self.path.parent)
                 self._folder = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | _SAFELY)
                 opened.callback(os.close, self._folder)
-                if os.fstat(self._folder).st_uid != os.geteuid():
-                    raise self._refusal("it belongs to another user")
-                fcntl.flock(self._folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except FileNotFoundError:
-                return False
-            except BlockingIOError as error:
+                self._lock()
+            except (FileNotFoundError, BlockingIOError) as error:
                 raise BlockingIOError(f"cannot write {self.sink}: another run is writing it") from error
             except OSError as error:
-                if error.errno in (errno.ELOOP, errno.ENOTDIR):
-                    raise self._refusal("it is a link" if self.path.is_symlink() else "it is not a folder") from error
-                if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS):  # as those of some clusters
+                if error.errno not in (errno.ELOOP, errno.ENOTDIR):
                     raise
-                text = f"the file system has no locks ({error.strerror}): start no other run with this output"
-                warnings.warn(f"{self.path}: {text}", stacklevel=2)
-            keeps = self._has_its_name()  # otherwise another process has removed it
-            if keeps:
-                opened.pop_all()
-            return keeps
+                raise self._refusal("it is a link" if self.path.is_symlink() else "it is not a folder") from error
+            self._find_windows(header, resume=resume)
+            self._opened = opened.pop_all()
+
+    def _lock(self) -> None:
+        """Lock the folder, which must be that of this user; a ``BlockingIOError`` if another run uses it."""
+        if os.fstat(self._folder).st_uid != os.geteuid():
+            raise self._refusal("it belongs to another user")
+        try:
+            fcntl.flock(self._folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS):  # as those of some clusters
+                raise
+            text = f"the file system has no locks ({error.strerror}): start no other run with this output"
+            warnings.warn(f"{self.path}: {text}", stacklevel=2)
+        if not self._has_its_name():
+            raise BlockingIOError  # another run has just ended
 
     def _has_its_name(self) -> bool:
         with suppress(FileNotFoundError):
@@ -201,16 +197,15 @@ class RunFolder:
         It is on the disk when the function returns.
         """
         names = list(names)
-        with disk_errors_named(self):
-            if array is not None:
-                names.append(f"{record.window:06d}.npy")
-                with self.create(names[-1]) as file:
-                    np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(array))
-                    file.write(array.data)  # errors of np.save do not contain the reason
-            digests = {name: self._digest(name, synchronised=True) for name in names}
-            content = {"record": plain_values(record), "files": digests}
-            self._write(_record_name(record.window), content, self._key)
-            self._finished[record.window] = record, names
+        if array is not None:
+            names.append(f"{record.window:06d}.npy")
+            with self.create(names[-1]) as file:
+                np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(array))
+                file.write(array.data)  # errors of np.save do not contain the reason
+        digests = {name: self._digest(name, synchronised=True) for name in names}
+        content = {"record": plain_values(record), "files": digests}
+        self._write(_record_name(record.window), content, self._key)
+        self._finished[record.window] = record, names
 
     def __contains__(self, window: int) -> bool:
         return window in self._finished
@@ -257,18 +252,16 @@ def _record_name(window: int) -> str:
 
 
 @contextmanager
-def disk_errors_named(folder: RunFolder) -> Iterator[None]:
-    """Add the name of the output and the number of finished windows to errors of the disk."""
+def _full_disk_named(folder: RunFolder) -> Iterator[None]:
+    """State the output, and the number of finished windows, in errors of a full disk."""
     try:
         yield
     except (OSError, RuntimeError) as error:
-        number = atomic.error_of_full_disk(error) or getattr(error, "errno", None)
-        if number is None and not isinstance(error, OSError):
+        number = atomic.error_of_full_disk(error)
+        if number is None:
             raise
         kept = f"; {folder.count} windows are complete, resume the run to continue" if folder.count else ""
-        # the words of the system: libraries add long descriptions
-        reason = os.strerror(number) if number else " ".join(str(error).split())
-        raise OSError(number, f"{reason}{kept}", str(folder.sink)) from error
+        raise OSError(number, f"{os.strerror(number)}{kept}", str(folder.sink)) from error
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -365,18 +358,14 @@ def run_to_file(
         for written in (sink, path):
             atomic.remove_abandoned(written)
         return report(complete, len(complete.windows))
-    folder = RunFolder(sink, header, resume=options.resume)
-    try:
+    with closing(RunFolder(sink, header, resume=options.resume)) as folder, _full_disk_named(folder):
         resumed = folder.count
         results = compute(folder)
-        with disk_errors_named(folder):
-            atomic.make_folder(path.parent)
-            manifest = stack_manifest(header, folder.records(), **results)
-            with atomic.whole_file(path) as part:
-                manifest.save(part)
-                write(folder)
-            sync(path.absolute().parent)  # the temporary folder is gone as well
+        atomic.make_folder(path.parent)
+        manifest = stack_manifest(header, folder.records(), **results)
+        with atomic.whole_file(path) as part:
+            manifest.save(part)
+            write(folder)
+        sync(path.absolute().parent)  # the temporary folder is gone as well
         folder.remove()
         return report(manifest, resumed)
-    finally:
-        folder.close()

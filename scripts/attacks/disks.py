@@ -14,7 +14,7 @@ from attacks.small_runs import FORMATS, Reference, fork, process, resume
 from attacks.trial import Trial
 
 _PAGE = 4096
-_PAGES = (0, 1, 5, 10, 16, 24, 32, 40, 50, 60, 75)  # of 4 KiB that are left, 0: read-only; a run needs 50 to 80
+_PAGES = (0, 1, 5, 10, 16, 24, 32, 40, 50, 60, 110)  # of 4 KiB that are left, 0: read-only; a run needs 50 to 80
 _NEW_MOUNTS, _NEW_USER = 0x20000, 0x10000000  # of unshare(2)
 
 
