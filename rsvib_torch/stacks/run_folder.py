@@ -84,7 +84,7 @@ class RunFolder:
     def __init__(self, sink: Path, header: Mapping[str, object], *, resume: bool) -> None:
         self.sink, self.path, self._above = sink, work_folder(sink), nearest_folder(sink)
         self._finished: dict[int, tuple[WindowRecord, list[str]]] = {}  # record and names of the files of windows
-        self._key = _blake2b(json.dumps(header).encode()).digest()
+        self._key = _blake2b(json.dumps(header, sort_keys=True).encode()).digest()
         atomic.make_folder(self.path.parent)
         with ExitStack() as opened:
             try:

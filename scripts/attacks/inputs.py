@@ -11,16 +11,12 @@ import tifffile
 from attacks.files import write_stack
 from attacks.small_runs import Reference, completed_or_refused, content, fork, process
 from attacks.trial import Trial
+from small_stack import CAMERA
 
 import rsvib_torch as rsv
 from rsvib_torch.commands.main import run_command
 
-_CAMERA = """
-[sensor]
-row_time = 1e-4
-exposure_rows = 6
-frame_rows = 72
-full_scale = 4095
+_SIMULATION = """
 [simulation]
 num_frames = 2
 frame_size = [48, 48]
@@ -37,7 +33,7 @@ def _write_originals(folder: Path, source: Path) -> None:
     for name in ("frames.tif", "pngs", "frames.zarr", "frames.raw", "frames.npy", "frames.h5", "frames.mkv"):
         write_stack(folder / name, counts)
     write_stack(folder / "scene.png", counts[:1])
-    (folder / "camera.toml").write_text(_CAMERA)
+    (folder / "camera.toml").write_text(CAMERA + _SIMULATION)
     times = "\n".join(f"{0.001 * index},0.1,0.2" for index in range(100))
     (folder / "motion.csv").write_text(f"time,x,y\n{times}\n")
     shutil.copy(source.with_name("vibrations.json"), folder / "vibrations.json")

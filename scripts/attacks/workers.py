@@ -9,8 +9,9 @@ from pathlib import Path
 
 import distributed
 import numpy as np
-from attacks.files import FULL_SCALE, TIMING, vibrating_counts, write_tiff
+from attacks.files import FULL_SCALE, vibrating_counts, write_tiff
 from attacks.trial import Trial
+from small_stack import TIMING
 
 import rsvib_torch as rsv
 from rsvib_torch.stacks import engines
