@@ -33,8 +33,7 @@ sys.path.append(str(PAGE.parents[1] / "tests"))  # attacks share cases with the 
 ATTACKS: dict[str, tuple[str, int]] = {  # first column of the table, and number of trials for the page
     "kills": ("runs killed and resumed", 207),
     "power_losses": ("power losses, resumed", 450),
-    "damaged_parts": ("damaged and edited files of interrupted runs, resumed", 144),
-    "links": ("links and foreign files as work folders", 60),
+    "damaged_parts": ("damaged, edited and replaced files of interrupted runs, resumed", 204),
     "inputs": ("outputs that are or contain inputs", 250),
     "concurrent": ("several runs with one output", 45),
     "disks": ("full and read-only disks", 99),

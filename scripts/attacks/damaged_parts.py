@@ -1,4 +1,4 @@
-"""After a kill, a file of the work folder is damaged, edited, or replaced by something else, and the run is resumed.
+"""After a kill, the work folder or a file of it is damaged, edited or replaced by something else; the run is resumed.
 
 The result must be complete, or a refusal in one line leaves everything as it was. Files of the user, to which links
 lead, must not change.
@@ -7,6 +7,7 @@ lead, must not change.
 import os
 import random
 import re
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from attacks.small_runs import FORMATS, Reference, completed_or_refused, content
 from attacks.trial import Trial
 
 _VALUES = ("null", "-1", "0.5", "9" * 400, "1e999", '"text"', "[]", "{}", "[" * 100_000, '"\\u0000\\ud800"')
+_USER = "user"  # folder of the user, beside that of the output
 
 
 def _swapped(file: Path, data: bytes, at: int) -> None:
@@ -28,7 +30,7 @@ def _swapped(file: Path, data: bytes, at: int) -> None:
 
 
 def _edited(file: Path, data: bytes, at: int) -> None:
-    """Replace a value of a JSON file, or some bytes."""
+    """Replace a number of a JSON file behind its hash, or some bytes."""
     numbers = list(re.finditer(rb"\b\d+\b", data[33:])) if file.suffix == ".json" else []
     start, end = numbers[at % len(numbers)].span() if numbers else (at, at + 3)
     head = 33 if numbers else 0
@@ -36,9 +38,9 @@ def _edited(file: Path, data: bytes, at: int) -> None:
 
 
 def _replaced(make: Callable[[Path], Any]) -> Callable[[Path, bytes, int], None]:
-    def replace(file: Path, data: bytes, at: int) -> None:
-        file.unlink()
-        make(file)
+    def replace(path: Path, data: bytes, at: int) -> None:
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+        make(path)
 
     return replace
 
@@ -55,18 +57,20 @@ _DAMAGES: dict[str, Callable[[Path, bytes, int], Any]] = {
     "edited": _edited,
     "nested": lambda file, data, at: file.write_bytes(b"[" * 200_000),
     "named differently": lambda file, data, at: file.rename(file.with_name("more.txt")),
+}
+_REPLACED = {  # also of the work folder itself
     "a folder": _replaced(Path.mkdir),
     "a pipe": _replaced(os.mkfifo),
-    "a link to a device": _replaced(lambda file: file.symlink_to("/dev/zero")),
-    "a link to itself": _replaced(lambda file: file.symlink_to(file.name)),
-    "a link": _replaced(lambda file: file.symlink_to(_precious(file))),
-    "a hard link": _replaced(lambda file: os.link(_precious(file), file)),
+    "a link to a device": _replaced(lambda path: path.symlink_to("/dev/zero")),
+    "a link to itself": _replaced(lambda path: path.symlink_to(path.name)),
+    "a link to a folder": _replaced(lambda path: path.symlink_to(_user_of(path))),
+    "a link to a file": _replaced(lambda path: path.symlink_to(_user_of(path) / "000000.npy")),
+    "a hard link": _replaced(lambda path: os.link(_user_of(path) / "000000.npy", path)),
 }
 
 
-def _precious(file: Path) -> Path:
-    """A file of the user, beside the folder of the output."""
-    return file.parents[2] / "precious"
+def _user_of(path: Path) -> Path:
+    return next(above / _USER for above in path.parents if (above / _USER).is_dir())
 
 
 def _listing(folder: Path) -> dict[str, Any]:
@@ -78,24 +82,24 @@ def _listing(folder: Path) -> dict[str, Any]:
 
 def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
     """Kinds of damage take turns, on other formats and files each time."""
-    reference, choice = Reference(folder / "reference"), random.Random(seed)
+    reference, choice, damages = Reference(folder / "reference"), random.Random(seed), _DAMAGES | _REPLACED
     for number, kind, place in in_turn(folder, count):
-        damage, out, name = list(_DAMAGES)[number % len(_DAMAGES)], place / "out", FORMATS[kind][0]
+        damage, out, name = list(damages)[number % len(damages)], place / "out", FORMATS[kind][0]
         kill_run(reference, out, kind, choice, windows=2)
-        files = sorted((out / f".{name}.rsvib").iterdir())
-        file = choice.choice([path for path in files if path.stat().st_size])
-        data, at = file.read_bytes(), choice.randrange(file.stat().st_size)
-        _precious(file).write_bytes(b"precious")
-        _DAMAGES[damage](file, data, at)
-        before = _listing(place)
+        (place / _USER).mkdir()
+        for of_user in ("settings.json", "000000.npy", name):
+            (place / _USER / of_user).write_bytes(b"precious")
+        work = out / f".{name}.rsvib"
+        path = choice.choice([one for one in sorted(work.iterdir()) if one.stat().st_size])
+        data, at = path.read_bytes(), choice.randrange(path.stat().st_size)
+        if damage in _REPLACED and choice.random() < 0.5:
+            path = work
+        damages[damage](path, data, at)
+        before, precious = _listing(place), content(place / _USER)
         code, result = fork(resume, reference.source, out / name, FORMATS[kind][1])
-        trial = completed_or_refused(
-            f"{kind}: {file.name} {damage} at byte {at}",
-            code,
-            result,
-            reference.difference(out, name) if code == 0 else "",
-        )
-        if _precious(file).read_bytes() != b"precious":
+        difference = reference.difference(out, name) if code == 0 else ""
+        trial = completed_or_refused(f"{kind}: {path.name}, {damage}, at byte {at}", code, result, difference)
+        if content(place / _USER) != precious:
             trial = Trial(trial.name, "lost", "a file of the user was changed")
         elif trial.outcome == "refused" and _listing(place) != before:
             trial = Trial(trial.name, "lost", f"refused, but changed: {result}")

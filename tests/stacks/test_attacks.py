@@ -13,11 +13,10 @@ from attacks.trial import FAILURES
 
 # attack: trials in a test, and least share of them that completes the run; the others are refused
 ATTACKS = {
-    "concurrent": (4, 1.0),
-    "damaged_parts": (16, 0.6),
+    "concurrent": (6, 0.5),
+    "damaged_parts": (17, 0.5),
     "inputs": (12, 0.0),
     "kills": (9, 1.0),
-    "links": (8, 0.0),
     "live_sessions": (1, 0.0),
     "power_losses": (9, 1.0),
 }
