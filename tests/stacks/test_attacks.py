@@ -16,9 +16,8 @@ ATTACKS = {
     "concurrent": (6, 0.5),
     "damaged_parts": (17, 0.5),
     "inputs": (12, 0.0),
-    "kills": (9, 1.0),
+    "interruptions": (27, 1.0),
     "live_sessions": (1, 0.0),
-    "power_losses": (9, 1.0),
 }
 
 
