@@ -33,7 +33,7 @@ sys.path.append(str(PAGE.parents[1] / "tests"))  # attacks share cases with the 
 ATTACKS: dict[str, tuple[str, int]] = {  # first column of the table, and number of trials for the page
     "interruptions": ("runs killed, or without power, and resumed", 540),
     "damaged_parts": ("damaged, edited and replaced files of interrupted runs, resumed", 204),
-    "inputs": ("outputs that are or contain inputs", 250),
+    "inputs": ("outputs that are or contain inputs", 150),
     "concurrent": ("several runs with one output", 45),
     "disks": ("full and read-only disks", 99),
     "live_sessions": ("recordings of a camera", 196),
