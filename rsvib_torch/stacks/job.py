@@ -134,7 +134,10 @@ class StackJob:
 
     def compute(self, window: Window, pixels: WindowFrames) -> WindowResult:
         """Detect the vibration in a window, restore its frames and judge the result."""
-        usable, faults = self._usable(window, pixels)
+        options, read = self.options, dict(zip(window.frames, pixels, strict=True))
+        found = ((index, frame_fault(read[index], index, options.full_scale, self.info.nodata)) for index in read)
+        faults = {index: fault for index, fault in found if fault is not None}
+        usable = {index: one for index, one in read.items() if index not in faults and not isinstance(one, str)}
         inside = {index: frame for index, frame in usable.items() if window.first <= index <= window.last}
         frames = self._images(inside)
         kept = tuple(index for index in usable if index in window.written)
@@ -142,20 +145,19 @@ class StackJob:
         as_taken = WindowResult(window, kept, self._unchanged(frames[: len(kept)]), None, None, None, bad)
         if faults and len(inside) < 2:
             return replace(as_taken, error=next(iter(faults.values())))
-        options = self.options
         if options.follow is True:
             return self._followed(as_taken, usable)
         timing = window_timing(self.timing, window, list(inside))
         try:
             if self.given is None:
                 motion: DetectedVibration | FreeMotion | None
-                motion = found = detect_vibration(frames, timing, **options.detection or {})
-                as_taken = replace(as_taken, detection=found)
-                if options.follow == "auto" and may_change(found, len(usable)):
+                motion = detected = detect_vibration(frames, timing, **options.detection or {})
+                as_taken = replace(as_taken, detection=detected)
+                if options.follow == "auto" and may_change(detected, len(usable)):
                     followed = self._followed(as_taken, usable)
                     if isinstance(followed.detection, FollowedVibration):
                         reliable = followed.detection.reliable.double().mean(0).sum()
-                        if reliable > found.reliable.sum():
+                        if reliable > detected.reliable.sum():
                             return followed
             else:
                 motion = self.given[window.index]
@@ -186,18 +188,6 @@ class StackJob:
         frames = restoration.frames if not as_taken.indices else restoration.frames[: len(as_taken.indices)]
         frames = frames if self.info.nodata is None else without_data(frames, taken)
         return replace(as_taken, restoration=restoration, frames=frames)
-
-    def _usable(self, window: Window, pixels: WindowFrames) -> tuple[dict[int, Array], dict[int, str]]:
-        """The frames of a window that can be used, and why others cannot."""
-        usable: dict[int, Array] = {}
-        faults: dict[int, str] = {}
-        for index, frame in zip(window.frames, pixels, strict=True):
-            fault = frame_fault(frame, index, self.options.full_scale, self.info.nodata)
-            if fault is not None:
-                faults[index] = fault
-            elif not isinstance(frame, str):
-                usable[index] = frame
-        return usable, faults
 
     def _images(self, frames: Mapping[int, Array]) -> Tensor:
         """Frames as stored as (T, H, W) or (T, C, H, W), full scale 1."""
