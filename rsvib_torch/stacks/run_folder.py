@@ -18,8 +18,8 @@ import shutil
 import stat
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -57,11 +57,9 @@ def work_folder(sink: Path) -> Path:
 def _difference(old: object, new: object, path: str = "") -> str | None:
     """The first key in which two tables differ, with both values; None if they are equal."""
     if isinstance(old, dict) and isinstance(new, dict):
-        for key in dict.fromkeys([*new, *old]):
-            difference = _difference(old.get(key), new.get(key), f"{path}.{key}" if path else str(key))
-            if difference:
-                return difference
-        return None
+        keys = dict.fromkeys([*new, *old])
+        found = (_difference(old.get(key), new.get(key), f"{path}.{key}".lstrip(".")) for key in keys)
+        return next(filter(None, found), None)
     texts = (one_line(json.dumps(value), 60) for value in (old, new))
     return None if old == new else "{} was {}, now it is {}".format(path, *texts)
 
@@ -70,8 +68,8 @@ def check_space(path: Path, needed: int) -> None:
     """Raise an ``OSError`` if the disk of a file to be written has less than ``needed`` free bytes."""
     free = shutil.disk_usage(nearest_folder(path)).free
     if needed > free:
-        reason = f"{os.strerror(errno.ENOSPC)}: a run needs {size_text(needed)}, {size_text(free)} are free"
-        raise OSError(errno.ENOSPC, reason, str(path))
+        text = f"{os.strerror(errno.ENOSPC)}: a run needs {size_text(needed)}, {size_text(free)} are free"
+        raise OSError(f"{path}: {text}")
 
 
 class RunFolder:
@@ -215,6 +213,10 @@ class RunFolder:
         """Number of finished windows."""
         return len(self._finished)
 
+    def kept(self) -> str:
+        """What an error of the run states about its finished windows."""
+        return f"; {self.count} windows are complete, resume the run to continue" if self.count else ""
+
     def records(self) -> list[WindowRecord]:
         """Records of the finished windows in order."""
         return [self._finished[window][0] for window in sorted(self._finished)]
@@ -249,19 +251,6 @@ class RunFolder:
 
 def _record_name(window: int) -> str:
     return f"{window:06d}.json"
-
-
-@contextmanager
-def _full_disk_named(folder: RunFolder) -> Iterator[None]:
-    """State the output, and the number of finished windows, in errors of a full disk."""
-    try:
-        yield
-    except (OSError, RuntimeError) as error:
-        number = atomic.error_of_full_disk(error)
-        if number is None:
-            raise
-        kept = f"; {folder.count} windows are complete, resume the run to continue" if folder.count else ""
-        raise OSError(number, f"{os.strerror(number)}{kept}", str(folder.sink)) from error
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -358,7 +347,7 @@ def run_to_file(
         for written in (sink, path):
             atomic.remove_abandoned(written)
         return report(complete, len(complete.windows))
-    with closing(RunFolder(sink, header, resume=options.resume)) as folder, _full_disk_named(folder):
+    with closing(RunFolder(sink, header, resume=options.resume)) as folder, atomic.full_disk_named(sink, folder.kept):
         resumed = folder.count
         results = compute(folder)
         atomic.make_folder(path.parent)
