@@ -144,15 +144,15 @@ class RunFolder:
             raise ValueError(f"{self.sink}: cannot resume: {difference}; delete {self.path} to start over")
         for name in records:
             entry = self._content(name, self._key)
-            with suppress(FileNotFoundError):
+            with suppress(OSError):  # a file is missing, or cannot be read
                 if entry is not None and all(self._digest(file) == digest for file, digest in entry["files"].items()):
                     record = decode(WindowRecord, entry["record"], name)
-                    if name == _record_name(record.window):
+                    if name == f"{record.window:06d}.json":
                         self._finished[record.window] = record, list(entry["files"])
         if stored != header:
             self._write(_SETTINGS, header)
 
-    def _file(self, name: str, mode: Literal["rb", "x+b"]) -> IO[bytes]:
+    def open(self, name: str, mode: Literal["rb", "x+b"] = "rb") -> IO[bytes]:
         """Open a file of the folder, wherever the folder is now, and never through a link."""
         return open(name, mode, opener=lambda name, flags: os.open(name, flags | _SAFELY, 0o600, dir_fd=self._folder))
 
@@ -167,7 +167,7 @@ class RunFolder:
 
     def _content(self, name: str, key: bytes = b"") -> Any:
         """The table in a file; None if the file is not as it was written, or with another key."""
-        with suppress(FileNotFoundError), self.open(name) as file:
+        with suppress(OSError), self.open(name) as file:
             digest, _, body = file.read().partition(b" ")
             if digest == _blake2b(body, key=key).hexdigest().encode():
                 return json.loads(body)
@@ -183,11 +183,7 @@ class RunFolder:
         """A new file of a window, whose name begins with the number of the window in six digits."""
         with suppress(FileNotFoundError):
             os.unlink(name, dir_fd=self._folder)
-        return self._file(name, "x+b")
-
-    def open(self, name: str) -> IO[bytes]:
-        """A file of the folder for reading."""
-        return self._file(name, "rb")
+        return self.open(name, "x+b")
 
     def add(self, record: WindowRecord, names: Sequence[str] = (), array: Array | None = None) -> None:
         """Enter the record of a window with its closed files, and an array, which becomes the last of them.
@@ -202,20 +198,16 @@ class RunFolder:
                 file.write(array.data)  # errors of np.save do not contain the reason
         digests = {name: self._digest(name, synchronised=True) for name in names}
         content = {"record": plain_values(record), "files": digests}
-        self._write(_record_name(record.window), content, self._key)
+        self._write(f"{record.window:06d}.json", content, self._key)
         self._finished[record.window] = record, names
 
     def __contains__(self, window: int) -> bool:
         return window in self._finished
 
-    @property
-    def count(self) -> int:
-        """Number of finished windows."""
-        return len(self._finished)
-
     def kept(self) -> str:
         """What an error of the run states about its finished windows."""
-        return f"; {self.count} windows are complete, resume the run to continue" if self.count else ""
+        count = len(self._finished)
+        return f"; {count} windows are complete, resume the run to continue" if count else ""
 
     def records(self) -> list[WindowRecord]:
         """Records of the finished windows in order."""
@@ -247,10 +239,6 @@ class RunFolder:
         with self._opened:
             if not self._finished:
                 self.remove()
-
-
-def _record_name(window: int) -> str:
-    return f"{window:06d}.json"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -348,7 +336,7 @@ def run_to_file(
             atomic.remove_abandoned(written)
         return report(complete, len(complete.windows))
     with closing(RunFolder(sink, header, resume=options.resume)) as folder, atomic.full_disk_named(sink, folder.kept):
-        resumed = folder.count
+        resumed = len(folder.records())
         results = compute(folder)
         atomic.make_folder(path.parent)
         manifest = stack_manifest(header, folder.records(), **results)

@@ -23,12 +23,14 @@ from attacks.small_runs import (
     Child,
     Reference,
     calls_of,
+    completed_or_refused,
     content,
     count_file_calls,
     finished_windows,
+    fork,
     in_turn,
     process,
-    resumed_trial,
+    resume,
 )
 from attacks.trial import Trial
 
@@ -148,4 +150,9 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
             yield Trial(title, "wrong", "an incomplete output has its name")
             continue
         finished = min(finished_windows(sink.parent, name), WINDOWS)
-        yield resumed_trial(reference, sink.parent, kind, title, finished)
+        code, result = fork(resume, reference.source, sink, options)
+        difference = reference.difference(sink.parent, name) if code == 0 else ""
+        trial = completed_or_refused(title, code, result, difference)
+        if trial.outcome == "refused" or (trial.outcome == "completed" and result < finished):
+            trial = Trial(title, "lost", f"{finished} windows were complete, resumed: {result}")
+        yield trial

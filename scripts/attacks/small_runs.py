@@ -247,20 +247,6 @@ def kill_run(reference: Reference, folder: Path, kind: str, choice: random.Rando
             return
 
 
-def resumed_trial(reference: Reference, folder: Path, kind: str, title: str, finished: int = 0) -> Trial:
-    """Resume a run, which must use the finished windows and give the result of an uninterrupted run."""
-    name, options = FORMATS[kind]
-    code, result = fork(resume, reference.source, folder / name, options)
-    if code != 0:
-        return Trial(title, "hang" if code is None else "traceback" if code == 1 else "lost", str(result))
-    difference = reference.difference(folder, name)
-    if difference:
-        return Trial(title, "wrong", difference)
-    if result < finished:
-        return Trial(title, "lost", f"{finished} windows were complete, {result} were resumed")
-    return Trial(title, "completed")
-
-
 def completed_or_refused(title: str, code: int | None, result: Any, difference: str) -> Trial:
     """Trial of a process that may refuse in one line; ``difference`` of its result if it is complete."""
     if code is None:
