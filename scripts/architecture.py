@@ -10,7 +10,7 @@ LAYERS: tuple[dict[str, str], ...] = (
         "export": "motions for other programs: angular rates",
     },
     {"config": "TOML files ↔ groups of options"},
-    {"stacks": "process.py: windows, jobs, memory planning; run_folder.py: a run to a file, its journal, resume"},
+    {"stacks": "process.py: windows, jobs, memory planning; run_folder.py: a run to a file, and how it resumes"},
     {
         "evaluation": "image quality, slanted edge (mtf/), Cramér–Rao bound",
         "tracking": "tracker.py: vibration frame by frame; following.py: through a stack, forwards and backwards",

@@ -31,22 +31,17 @@ sys.path.append(str(PAGE.parents[1] / "tests"))  # attacks share cases with the 
 # ``count`` trials with files in ``folder`` and yields their results; what is drawn at random depends on ``seed`` only.
 # Modules are imported when they are used: child processes of the attacks on storage import this file for every trial.
 ATTACKS: dict[str, tuple[str, int]] = {  # first column of the table, and number of trials for the page
-    "kills": ("runs killed and resumed", 207),
-    "power_losses": ("power losses, resumed", 450),
-    "damaged_parts": ("damaged parts of interrupted runs, resumed", 63),
-    "journals": ("damaged journals", 250),
-    "links": ("links and foreign files as work folders", 110),
-    "inputs": ("outputs that are or contain inputs", 250),
+    "interruptions": ("runs killed, or without power, and resumed", 540),
+    "damaged_parts": ("damaged, edited and replaced files of interrupted runs, resumed", 204),
+    "inputs": ("outputs that are or contain inputs", 150),
     "concurrent": ("several runs with one output", 45),
-    "disks": ("full and read-only disks", 66),
-    "live_sessions": ("recordings of a camera", 204),
+    "disks": ("full and read-only disks", 99),
+    "live_sessions": ("recordings of a camera", 196),
     "memory": ("`--memory` in different layouts", 15),
     "crafted": ("crafted files", 200),
-    "workers": ("killed and missing Dask workers", 9),
+    "workers": ("killed Dask workers", 7),
     "api": ("hostile arguments of Python functions", 4000),
     "mutated": ("randomly damaged files", 2400),
-    "readers": ("damaged files of motion and gyroscopes", 300),
-    "buffers": ("buffers of the caller, written to later", 100),
     "spans": ("frames over long time spans", 50),
     "images": ("frames that do not determine a motion", 200),
 }

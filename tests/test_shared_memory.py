@@ -143,3 +143,17 @@ def test_results_share_no_memory_with_arguments(name, as_array):
     assert not any(np.may_share_memory(*pair) for pair in itertools.product(memory_of(result), memory_of(given)))
     for before, after in zip(arguments, given, strict=True):  # and arguments are not changed
         torch.testing.assert_close(torch.as_tensor(after), before, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("buffers", [1, 2, 3, 4])
+def test_buffers_that_are_written_to_again_change_no_tracked_frame(buffers):
+    memory = torch.zeros(buffers, ROWS, COLUMNS)
+    trackers = [rsv.VibrationTracker(TIMING, window=4) for _ in range(2)]
+    results = []
+    for index in range(24):
+        buffer = memory[index % buffers].copy_(FRAMES[index % 4])
+        results.append(
+            [tracker.update(frame) for tracker, frame in zip(trackers, (FRAMES[index % 4], buffer), strict=True)]
+        )
+        buffer.fill_(0.5)
+    assert all(torch.equal(of_copy.restored, of_buffer.restored) for of_copy, of_buffer in results)

@@ -11,7 +11,7 @@ import re
 import shutil
 import stat
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import combinations
 from pathlib import Path
@@ -79,13 +79,19 @@ def _locked(folder: Path, *, wait: bool = False) -> Iterator[int]:
         os.close(file)
 
 
-def error_of_full_disk(error: Exception) -> int | None:
-    """Number of the error of the system if a disk is full, or a file larger than permitted; otherwise None."""
-    stated = re.search(r"errno = (\d+)", str(error))  # in a text of HDF5
-    number = int(stated[1]) if stated else getattr(error, "errno", None)
-    if "requested and" in str(error):  # NumPy does not state why an array is cut off
-        number = errno.ENOSPC
-    return number if number in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT) else None
+@contextmanager
+def full_disk_named(path: Path, more: Callable[[], str] = str) -> Iterator[None]:
+    """State the output, and what ``more`` returns, in errors of a full disk, or of files larger than permitted."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        stated = re.search(r"errno = (\d+)", str(error))  # in a text of HDF5
+        number = int(stated[1]) if stated else getattr(error, "errno", None)
+        if "requested and" in str(error):  # NumPy does not state why an array is cut off
+            number = errno.ENOSPC
+        if number not in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT):
+            raise
+        raise OSError(number, f"{os.strerror(number)}{more()}", str(path)) from error
 
 
 @contextmanager
@@ -106,13 +112,8 @@ def temporary_folder(path: Path) -> Iterator[Path]:
             with suppress(OSError):  # file systems without locks
                 opened.enter_context(_locked(folder, wait=True))
         opened.callback(shutil.rmtree, folder, ignore_errors=True)
-        try:
+        with full_disk_named(path):
             yield folder
-        except (OSError, RuntimeError) as error:
-            number = error_of_full_disk(error)
-            if number is None:
-                raise
-            raise OSError(number, os.strerror(number), str(path)) from error
 
 
 def check_not_special(path: _Path) -> None:

@@ -1,4 +1,4 @@
-"""Stacks of any length, processed window by window: windows, engines, journal and resume, manifest, memory planning."""
+"""Stacks of any length, processed window by window: windows, engines, runs and how they resume, manifest, memory."""
 
 import lazy_loader
 

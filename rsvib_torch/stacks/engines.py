@@ -40,22 +40,16 @@ def _distributed() -> Any:
     return needed_package("distributed", "the Dask engine", "distributed")
 
 
-def _compute_on_worker(job: StackJob, window: Window, one_thread: bool) -> StoredWindow:
+def _compute_on_worker(job: StackJob, window: Window) -> StoredWindow:
     share_one_heap(keep_freed=True)
-    default_threads = torch.get_num_threads()
-    if one_thread:
-        torch.set_num_threads(1)
-    try:
-        if job.device.startswith("cuda"):  # workers with a number as their name use the GPUs in turn
-            count, name = torch.cuda.device_count(), _distributed().get_worker().name
-            if count == 0:
-                raise RuntimeError("this worker has no CUDA device; use device='cpu'")
-            job = replace(job, device=f"cuda:{int(name) % count}" if str(name).isdecimal() else "cuda:0")
-        with closing(read_windows(job, [window])) as read:
-            _, pixels = next(read)
-        return job.stored(job.compute(window, pixels), pixels)
-    finally:
-        torch.set_num_threads(default_threads)
+    if job.options.device.startswith("cuda"):  # workers with a number as their name use the GPUs in turn
+        count, name = torch.cuda.device_count(), _distributed().get_worker().name
+        if count == 0:
+            raise RuntimeError("this worker has no CUDA device; use device='cpu'")
+        device = f"cuda:{int(name) % count}" if str(name).isdecimal() else "cuda:0"
+        job = replace(job, options=replace(job.options, device=device))
+    with closing(compute_here(job, [window], job.stored, at_once=1)) as results:
+        return next(results)
 
 
 def _dask_client(scheduler: str, workers: int) -> Any:
@@ -105,7 +99,6 @@ def compute_with_dask(
     scheduler ``"local"`` starts a number of workers on this machine.
     """
     job = replace(job, source=job.source.absolute())
-    one_thread = not all(window.alone for window in windows)
     waiting: deque[tuple[Any, Window]] = deque()
     with _dask_client(scheduler, workers) as client:
 
@@ -113,7 +106,7 @@ def compute_with_dask(
             # the job is sent with every task: scattered data are lost with the worker that holds them
             given = None if job.given is None else {window.index: job.given[window.index]}
             of_window = replace(job, given=given)
-            return client.submit(_compute_on_worker, of_window, window, one_thread, retries=3, pure=False), window
+            return client.submit(_compute_on_worker, of_window, window, retries=3, pure=False), window
 
         def capacity() -> int:
             return 2 * max(1, len(client.scheduler_info(n_workers=-1)["workers"]))

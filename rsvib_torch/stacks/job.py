@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import closing
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -15,7 +15,7 @@ from torch import Tensor
 from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.arrays import Channels, channel_axis
 from rsvib_torch.checks.values import check_choice
-from rsvib_torch.detection import DetectionResult, detect_vibration
+from rsvib_torch.detection import detect_vibration
 from rsvib_torch.files.reading import Table
 from rsvib_torch.frames.mosaic import check_mosaic, colour_frames
 from rsvib_torch.frames.pixels import enlarged
@@ -29,8 +29,8 @@ from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import (
-    BadFrames,
     OptionTable,
+    ProcessStackOptions,
     RestorationOptions,
     StackDetectionOptions,
     StackOptions,
@@ -61,13 +61,17 @@ class WindowResult(Summarised):
     window: Window
     indices: tuple[int, ...]  # of ``frames`` in the stack; empty if all frames were restored jointly as one image
     frames: Tensor  # with full scale 1, (T, H, W) or (T, C, H, W): restored, or as taken
-    restored: bool
     # with the time origin at the window's first frame; a ``FollowedVibration`` of the frames ``indices`` if it was
     # followed from frame to frame; None if it failed
-    detection: DetectionResult | DetectedVibration | None
+    detection: DetectedVibration | None
     restoration: RestoredFrames | None  # None without a detection
     error: str | None  # why detection or restoration failed
     bad_frames: Mapping[int, str]  # frames of ``window.written`` that could not be used; they are not in ``frames``
+
+    @property
+    def restored(self) -> bool:
+        """Whether the frames are restored."""
+        return self.restoration is not None and self.restoration.restored
 
     @property
     def changed(self) -> dict[int, Tensor]:
@@ -89,12 +93,7 @@ class WindowResult(Summarised):
         return "\n".join([*lines, *(f"frame {index}: {fault}" for index, fault in self.bad_frames.items())])
 
 
-@dataclass(frozen=True, eq=False)
-class StoredWindow:
-    """Frames of a window as they are stored, and its record."""
-
-    frames: list[Array]
-    record: WindowRecord
+StoredWindow = tuple[list[Array], WindowRecord]  # frames as they are stored, and the record
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,18 +103,10 @@ class StackJob:
     source: Path  # the stack
     info: StackInfo  # what its file states
     timing: SensorTiming  # timing of the whole stack
-    full_scale: float | None  # count that corresponds to 1.0; None for floats
-    detection: OptionTable = None  # options of ``detect_vibration``
-    # options of ``restore``, for frames whose full scale is 1; None for detection only
-    restoration: OptionTable = None
-    # detections to use instead, by number of the window; None where a window has none
-    given: Mapping[int, DetectedVibration | None] | None = None
-    motion: FreeMotion | None = None  # motion of all frames to use instead, from the start of the first one
-    bad_frames: BadFrames = "pass"  # whether frames that cannot be used are written unchanged or omitted
-    force: bool = False  # whether to write restored frames even if they are judged worse than the raw ones
-    device: str = "cpu"  # device for the computation
-    window: int = StackOptions.window  # maximum number of frames of a window
-    follow: bool | Literal["auto"] = False  # whether the vibration is followed from frame to frame
+    # with the full scale (None for floats) and the device that are used; ``restoration`` None is detection only
+    options: ProcessStackOptions
+    # motions to use instead of a detection, from the first frame of the window with that number; None: it has none
+    given: Mapping[int, DetectedVibration | FreeMotion | None] | None = None
 
     def open(self) -> FrameReader:
         """Open the stack, which must not have changed."""
@@ -128,7 +119,7 @@ class StackJob:
     @cached_property
     def chosen(self) -> RestorationOptions:
         """All options of ``restore``; ``joint=True`` makes one image of a window."""
-        return RestorationOptions(**(self.restoration or {}))
+        return RestorationOptions(**(self.options.restoration or {}))
 
     def _unchanged(self, frames: Tensor) -> Tensor:
         """Frames that were not restored, in the shape of restored ones."""
@@ -139,93 +130,73 @@ class StackJob:
         """The output ``out`` with full scale, times and frame rate; ``timing`` is that of the caller."""
         times = None if out.frame_times is None else exposure_times(self.info, timing)
         rate = out.frame_rate or timing.frame_rate
-        return replace(out, full_scale=self.full_scale, frame_times=times, time_error=0.0, frame_rate=rate)
+        return replace(out, full_scale=self.options.full_scale, frame_times=times, time_error=0.0, frame_rate=rate)
 
     def compute(self, window: Window, pixels: WindowFrames) -> WindowResult:
         """Detect the vibration in a window, restore its frames and judge the result."""
-        usable, faults = self._usable(window, pixels)
+        options, read = self.options, dict(zip(window.frames, pixels, strict=True))
+        found = ((index, frame_fault(read[index], index, options.full_scale, self.info.nodata)) for index in read)
+        faults = {index: fault for index, fault in found if fault is not None}
+        usable = {index: one for index, one in read.items() if index not in faults and not isinstance(one, str)}
         inside = {index: frame for index, frame in usable.items() if window.first <= index <= window.last}
         frames = self._images(inside)
         kept = tuple(index for index in usable if index in window.written)
         bad = {index: fault for index, fault in faults.items() if index in window.written}
-        as_taken = WindowResult(window, kept, self._unchanged(frames[: len(kept)]), False, None, None, None, bad)
+        as_taken = WindowResult(window, kept, self._unchanged(frames[: len(kept)]), None, None, None, bad)
         if faults and len(inside) < 2:
             return replace(as_taken, error=next(iter(faults.values())))
-        if self.follow is True:
+        if options.follow is True:
             return self._followed(as_taken, usable)
         timing = window_timing(self.timing, window, list(inside))
-        detection: DetectionResult | DetectedVibration | None = None
         try:
-            found: DetectionResult | DetectedVibration | FreeMotion | None
-            if self.motion is not None:
-                found = self._motion_of(window)
-            elif self.given is not None:
-                found = detection = self.given[window.index]
-            else:
-                found = detection = detect_vibration(frames, timing, **self.detection or {})
-                if self.follow == "auto" and may_change(detection, len(usable)):
+            if self.given is None:
+                motion: DetectedVibration | FreeMotion | None
+                motion = detected = detect_vibration(frames, timing, **options.detection or {})
+                as_taken = replace(as_taken, detection=detected)
+                if options.follow == "auto" and may_change(detected, len(usable)):
                     followed = self._followed(as_taken, usable)
-                    reliable = followed.detection is not None and followed.detection.reliable.double().mean(0).sum()
-                    if reliable > detection.reliable.sum():
-                        return followed
-            if found is None or self.restoration is None:
-                missing = "no detection was given for this window" if found is None else None
-                return replace(as_taken, detection=detection, error=missing)
+                    if isinstance(followed.detection, FollowedVibration):
+                        reliable = followed.detection.reliable.double().mean(0).sum()
+                        if reliable > detected.reliable.sum():
+                            return followed
+            else:
+                motion = self.given[window.index]
+                missing = "no detection was given for this window" if motion is None else None
+                detection = motion if isinstance(motion, DetectedVibration) else None
+                as_taken = replace(as_taken, detection=detection, error=missing)
+            if motion is None or options.restoration is None:
+                return as_taken
             restoration = restore_trusted(
                 frames,
                 timing,
-                found,
-                self.restoration,
-                force=self.force,
+                motion,
+                options.restoration,
+                force=options.force,
                 first_frames=len(kept) if len(kept) > 1 and not self.chosen.joint else None,
                 most_pairs=8 if window.alone else 2,  # limits the time of the verdict
             )
         except (ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
-            return replace(as_taken, detection=detection, error=" ".join(str(error).split()))
+            return replace(as_taken, error=" ".join(str(error).split()))
         if self.chosen.joint is True and restoration.restored:  # one image of all frames
             as_taken, kept = replace(as_taken, indices=()), tuple(inside)
-        return self._restored(as_taken, frames[: len(kept)], detection, restoration)
+        return self._restored(as_taken, frames[: len(kept)], restoration)
 
-    def _restored(
-        self,
-        as_taken: WindowResult,
-        taken: Tensor,
-        detection: DetectionResult | DetectedVibration | None,
-        restoration: RestoredFrames,
-    ) -> WindowResult:
+    def _restored(self, as_taken: WindowResult, taken: Tensor, restoration: RestoredFrames) -> WindowResult:
         """The result of a window whose frames were restored, from those frames as taken."""
-        result = replace(as_taken, restored=restoration.restored, detection=detection, restoration=restoration)
         if not restoration.restored:
-            return result
+            return replace(as_taken, restoration=restoration)
         frames = restoration.frames if not as_taken.indices else restoration.frames[: len(as_taken.indices)]
-        return replace(result, frames=frames if self.info.nodata is None else without_data(frames, taken))
-
-    def _motion_of(self, window: Window) -> FreeMotion:
-        """The given motion in a window, with the time origin at its first frame."""
-        assert self.motion is not None
-        starts = self.timing.frame_starts(window.last + 1)
-        first, last = float(starts[window.first] - starts[0]), float(starts[-1] - starts[0])
-        readout = self.info.shape[int(self.timing.scan_axis)] * self.timing.row_time + self.timing.exposure_time
-        return self.motion.within(first - readout, last + 2 * readout).retimed(first).to(self.device)
-
-    def _usable(self, window: Window, pixels: WindowFrames) -> tuple[dict[int, Array], dict[int, str]]:
-        """The frames of a window that can be used, and why others cannot."""
-        usable: dict[int, Array] = {}
-        faults: dict[int, str] = {}
-        for index, frame in zip(window.frames, pixels, strict=True):
-            fault = frame_fault(frame, index, self.full_scale, self.info.nodata)
-            if fault is not None:
-                faults[index] = fault
-            elif not isinstance(frame, str):
-                usable[index] = frame
-        return usable, faults
+        frames = frames if self.info.nodata is None else without_data(frames, taken)
+        return replace(as_taken, restoration=restoration, frames=frames)
 
     def _images(self, frames: Mapping[int, Array]) -> Tensor:
         """Frames as stored as (T, H, W) or (T, C, H, W), full scale 1."""
         if not frames:
             return torch.empty((0, *self.info.shape[1:]), dtype=torch.float32, device="cpu")
-        stored = np.stack(list(frames.values()))
-        return counts_to_frames(stored, self.full_scale, str(self.source), self.info.nodata).to(self.device)
+        return self._as_taken(np.stack(list(frames.values()))).to(self.options.device)
+
+    def _as_taken(self, stored: Array) -> Tensor:
+        return counts_to_frames(stored, self.options.full_scale, str(self.source), self.info.nodata)
 
     def _followed(self, as_taken: WindowResult, usable: Mapping[int, Array]) -> WindowResult:
         """The result of a window whose vibration is followed, from its usable frames and those around it."""
@@ -236,14 +207,14 @@ class StackJob:
             timing = window_timing(self.timing, window, list(usable))
             found = follow_vibration(self._images(usable), timing, channels="first")
             followed = FollowedVibration.stacked([found[number] for number, i in enumerate(usable) if i in kept])
-            if self.restoration is None:
-                return replace(as_taken, detection=followed)
-            frames = as_taken.frames
-            timing = window_timing(self.timing, window, kept)
-            restoration = restore_followed(frames, timing, followed, self.restoration, force=self.force)
+            as_followed, options = replace(as_taken, detection=followed), self.options
+            if options.restoration is None:
+                return as_followed
+            frames, timing = as_taken.frames, window_timing(self.timing, window, kept)
+            restoration = restore_followed(frames, timing, followed, options.restoration, force=options.force)
         except (ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
             return replace(as_taken, error=" ".join(str(error).split()))
-        return self._restored(as_taken, frames, followed, restoration)
+        return self._restored(as_followed, frames, restoration)
 
     def stored(self, result: WindowResult, pixels: WindowFrames) -> StoredWindow:
         """The frames of a result as they are stored: frames that were not restored are unchanged.
@@ -253,25 +224,24 @@ class StackJob:
         dtype = np.dtype(self.info.dtype)
 
         def counts(images: Tensor) -> Array:
-            return scales.frames_to_counts(images, dtype, self.full_scale, self.info.nodata)
+            return scales.frames_to_counts(images, dtype, self.options.full_scale, self.info.nodata)
 
         if result.restored and not result.indices:
             frames = list(counts(result.frames))
-            return StoredWindow(frames, self.record(result, len(frames)))
+            return frames, self.record(result, len(frames))
         written = list(result.window.written)
         restored, frames = result.changed, []
         for index in [written[len(written) // 2]] if self.chosen.joint is True else written:
             if index in restored:
                 frames.append(counts(restored[index]))
-            elif self.bad_frames == "pass" or index not in result.bad_frames:
+            elif self.options.bad_frames == "pass" or index not in result.bad_frames:
                 frame = pixels[index - result.window.frames.start]
                 if isinstance(frame, str):
                     frame = np.full(self.info.shape[1:], np.nan if dtype.kind == "f" else 0, dtype)
                 if self.chosen.scale != 1 or self.chosen.mosaic is not None:  # the shape of restored ones
-                    taken = counts_to_frames(frame[None], self.full_scale, str(self.source), self.info.nodata)
-                    frame = counts(self._unchanged(taken)[0])
+                    frame = counts(self._unchanged(self._as_taken(frame[None]))[0])
                 frames.append(frame)
-        return StoredWindow(frames, self.record(result, len(frames)))
+        return frames, self.record(result, len(frames))
 
     def record(self, result: WindowResult, written: int) -> WindowRecord:
         """The record of a result of which ``written`` frames were written."""
@@ -306,7 +276,7 @@ def read_windows(job: StackJob, windows: Iterable[Window]) -> Generator[tuple[Wi
     """Windows with the pixels of their frames, or why they cannot be read; frames that two share are read once."""
     with closing(job.open()) as reader:
         last: dict[int, Array | str] = {}  # the last frames of the window before
-        shared = 1 + (2 * MARGIN if job.follow else 0)
+        shared = 1 + (2 * MARGIN if job.options.follow else 0)
         for window in windows:
             frames = [last[index] if index in last else stored_frame(reader.frame, index) for index in window.frames]
             last = dict(zip(window.frames[-shared:], frames[-shared:], strict=True))
@@ -329,26 +299,46 @@ def single_frame_options(restoration: OptionTable) -> Table:
     return {name: value for name, value in (restoration or {}).items() if name not in _TOGETHER}
 
 
-def _follows(stated: Table) -> bool | Literal["auto"]:
+def _follows(options: ProcessStackOptions) -> bool | Literal["auto"]:
     """Whether it is followed; ``"auto"`` is not where options are given that frames one by one do not have."""
-    follow: bool | Literal["auto"] = stated["follow"]
-    is_known = bool(stated["detection"]) or any(stated.get(name) is not None for name in ("given", "motion"))
-    if follow is True:
+    is_known = bool(options.detection) or options.given is not None or options.motion is not None
+    if options.follow is True:
         if is_known:
             raise ValueError("follow=True has no options of detection, and no given detections")
-        single_frame_options(stated.get("restoration"))
-    elif follow == "auto" and (is_known or options_of_windows(stated.get("restoration"))):
+        single_frame_options(options.restoration)
+    elif options.follow == "auto" and (is_known or options_of_windows(options.restoration)):
         return False
-    return follow
+    return options.follow
+
+
+def _given(
+    options: ProcessStackOptions, info: StackInfo, timing: SensorTiming, windows: list[Window]
+) -> dict[int, DetectedVibration | FreeMotion | None] | None:
+    """The given motion of every window, with the time origin at its first frame; None if none is given."""
+    motion, given = options.motion, options.given
+    if motion is None:
+        if given is not None and len(given) != len(windows):
+            raise ValueError(
+                f"given has {len(given)} detections for {len(windows)} windows of at most {options.window} frames; "
+                "pass one for each window"
+            )
+        return None if given is None else dict(enumerate(given))
+    if options.detection or given is not None or not isinstance(motion, FreeMotion):
+        raise ValueError("motion must be a FreeMotion; it has no detection, given detections or follow beside it")
+    starts: list[float] = (timing.frame_starts(info.shape[0]) - timing.frame_starts(1)).tolist()
+    readout = info.shape[int(timing.scan_axis)] * timing.row_time + timing.exposure_time
+    ends = [(starts[window.first], starts[window.last]) for window in windows]
+    parts = [motion.within(first - readout, last + 2 * readout).retimed(first) for first, last in ends]
+    return {window.index: part.to(options.device) for window, part in zip(windows, parts, strict=True)}
 
 
 def plan_job(
-    source: PathLike, timing: SensorTiming, options: StackDetectionOptions, *, here: bool = True
+    source: PathLike, timing: SensorTiming, options: StackDetectionOptions
 ) -> tuple[StackJob, list[Window], int]:
     """The job of a run, its windows, and how many of them to compute at once.
 
     Frames are restored if the options are ``StackOptions``. The free memory limits the number of windows that are
-    computed ``here``, on this machine.
+    computed at once, on this machine.
     """
     info = read_stack_info(source)
     full_scale = info.full_scale if options.full_scale is None else options.full_scale
@@ -361,29 +351,27 @@ def plan_job(
     default = "cuda" if torch.cuda.is_available() else "cpu"
     device = default if options.device == "auto" else options.device
     on_gpu = device != "cpu"
-    names = [field.name for field in fields(StackJob)]  # many of which are options
-    stated: Table = {name: getattr(options, name) for name in names if hasattr(options, name)}
-    if isinstance(options, StackOptions):
-        stated["restoration"] = options.restoration or {}
-    if stated.get("given") is not None:
-        stated["given"] = dict(enumerate(stated["given"]))
-    stated |= {"full_scale": full_scale, "device": device, "follow": _follows(stated)}
-    job = StackJob(Path(source), info, timing, **stated)
+    restoration = (options.restoration or {}) if isinstance(options, StackOptions) else None
+    of_job = {"full_scale": full_scale, "device": device, "restoration": restoration, "progress": None}
+    stated = ProcessStackOptions(**{**vars(options), **of_job})
+    stated = replace(stated, follow=_follows(stated))
+    margin = MARGIN if stated.follow else 0
+    windows = cut_windows(info.shape[0], stated.window, margin)
+    given = _given(stated, info, timing, windows)
+    job = StackJob(Path(source), info, timing, replace(stated, given=None, motion=None), given)
     if job.chosen.mosaic is not None:
         check_mosaic(job.chosen.mosaic, info.shape, str(source))
     check_optics(job.chosen.optics)
-    margin = MARGIN if job.follow else 0
-    windows = cut_windows(info.shape[0], job.window, margin)
     if options.workers is not None:
         most = options.workers
     elif on_gpu:
         most = 1
     else:
         most = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if not here:  # the memory of other machines is not known
+    if stated.scheduler not in (None, "local"):  # the memory of other machines is not known
         return job, windows, most
     at_once = windows_at_once(
-        info, job.window, memory=options.memory, most=most, restoration=job.restoration, on_gpu=on_gpu, margin=margin
+        info, stated.window, memory=options.memory, most=most, restoration=restoration, on_gpu=on_gpu, margin=margin
     )
     return job, windows, at_once
 
@@ -445,6 +433,9 @@ def restore_block(
     if frames.dtype.kind != "f":
         scale = scales.required_full_scale(scale, frames.dtype, "frames")
     info = StackInfo(stored.shape, stored.dtype.name, scale)
-    job = StackJob(Path("frames"), info, timing, scale, detection, options, force=force, device=device)
+    chosen = ProcessStackOptions(
+        detection=detection, restoration=options, full_scale=scale, force=force, device=device, follow=False
+    )
+    job = StackJob(Path("frames"), info, timing, chosen)
     window, pixels = Window(0, 0, len(stored) - 1, len(stored)), list(stored)
-    return np.moveaxis(np.stack(job.stored(job.compute(window, pixels), pixels).frames), -3, axis)
+    return np.moveaxis(np.stack(job.stored(job.compute(window, pixels), pixels)[0]), -3, axis)

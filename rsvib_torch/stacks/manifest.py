@@ -319,31 +319,24 @@ def fingerprint(path: Path) -> Table:
     return {"name": name, "bytes": sum(sizes), "sha256_of_samples": digest.hexdigest()}
 
 
+# options on which the result depends
+_SETTINGS = ("full_scale", "window", "follow", "detection", "restoration", "bad_frames", "force", "device")
+
+
 def manifest_header(job: StackJob, output: str | None, compression: str | None) -> Table:
-    """Everything on which the result depends, as JSON: a run is resumed only if it is unchanged."""
+    """Everything on which the result depends, for JSON: a run is resumed only if it is unchanged."""
     given = None
-    if job.given is not None or job.motion is not None:
-        detected = [one and DetectedVibration.of(one) for one in (job.given or {}).values()]
-        given = hashlib.sha256(json.dumps(plain_values([*detected, job.motion])).encode()).hexdigest()
-    header = {
+    if job.given is not None:
+        plain = [DetectedVibration.of(one) if isinstance(one, DetectedVibration) else one for one in job.given.values()]
+        given = hashlib.sha256(json.dumps(plain_values(plain)).encode()).hexdigest()
+    options = {name: getattr(job.options, name) for name in _SETTINGS}
+    options["device"] = job.options.device.partition(":")[0]
+    return {
         "input": {**fingerprint(job.source), "shape": list(job.info.shape), "dtype": job.info.dtype},
-        "settings": {
-            "sensor": job.timing.to_dict(),
-            "full_scale": job.full_scale,
-            "window": job.window,
-            "follow": job.follow,
-            "detection": dict(job.detection or {}),
-            "restoration": None if job.restoration is None else dict(job.restoration),
-            "given": given,
-            "bad_frames": job.bad_frames,
-            "force": job.force,
-            "device": job.device.partition(":")[0],
-        },
+        "settings": {"sensor": job.timing.to_dict(), "given": given, **options},
         "versions": {name: version(name) for name in ("rsvib_torch", "torch", "numpy")},
         "output": None if output is None else {"name": output, "compression": compression},
     }
-    copy: Table = json.loads(json.dumps(header))
-    return copy
 
 
 def stack_manifest(header: Table, records: Iterable[WindowRecord], **results: Any) -> StackManifest:

@@ -12,7 +12,6 @@ from rsvib_torch.files.reading import Table
 from rsvib_torch.frames.entry_points import file_options, source_options
 from rsvib_torch.io.stack_reading import PathLike
 from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, stack_files, write_frames
-from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import DetectStackOptions, ProcessStackOptions, Progress, StackOptions
@@ -71,8 +70,8 @@ def detect_stack(source: PathLike, sink: PathLike, timing: SensorTiming, options
     job, windows, at_once = plan_job(source, timing, options)
     check_outputs([sink], stack_files(source))
     check_writable(Path(sink))
-    results = compute_here(job, windows, lambda result, _: StoredWindow([], job.record(result, 0)), at_once=at_once)
-    records = (stored.record for stored in _watched(results, windows, windows, [], options.progress))
+    results = compute_here(job, windows, lambda result, _: (list[Array](), job.record(result, 0)), at_once=at_once)
+    records = (record for _, record in _watched(results, windows, windows, [], options.progress))
     stack_manifest(manifest_header(job, None, None), records).save(sink)
 
 
@@ -104,7 +103,7 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
         OSError: If a file cannot be read or written; the run can then be resumed.
         ValueError: If a value is out of range, the stack is not readable, a window does not fit into the memory,
             detection fails in all first windows, an output is or contains the input or lies inside it, input, settings
-            or versions differ from those of the run to resume, or its journal is damaged.
+            or versions differ from those of the run to resume.
 
     Example:
         >>> import tempfile
@@ -121,16 +120,8 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
         True
     """
     sink = Path(sink)
-    scheduler, compression, given = options.scheduler, options.compression, options.given
-    other = options.follow is True or options.detection or given is not None
-    if options.motion is not None and (other or not isinstance(options.motion, FreeMotion)):
-        raise ValueError("motion must be a FreeMotion; it has no detection, given detections or follow beside it")
-    job, windows, at_once = plan_job(source, timing, options, here=scheduler in (None, "local"))
-    if given is not None and len(given) != len(windows):
-        raise ValueError(
-            f"given has {len(given)} detections for {len(windows)} windows of at most {job.window} frames; "
-            "pass one for each window"
-        )
+    compression = options.compression
+    job, windows, at_once = plan_job(source, timing, options)
     joined = job.chosen.joint is True
     out = job.info.with_frames(len(windows) if joined else job.info.shape[0])
     out = out.restored_as(job.chosen.scale, job.chosen.mosaic)
@@ -147,19 +138,19 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
     def compute(folder: RunFolder) -> Table:
         nonlocal out
         remaining = [window for window in windows if window.index not in folder]
-        frames = len(remaining) if joined else sum(window.kept for window in remaining)
+        count = len(remaining) if joined else sum(window.kept for window in remaining)
         # the finished windows and the output are on the disk together, until the output is complete
-        frames += out.shape[0] if compression is None and form.name in _UNCOMPRESSED else 0
-        check_space(sink, frames * out.frame_bytes)
-        if scheduler is None:
+        count += out.shape[0] if compression is None and form.name in _UNCOMPRESSED else 0
+        check_space(sink, count * out.frame_bytes)
+        if options.scheduler is None:
             results = compute_here(job, remaining, finish, at_once=at_once)
         else:
-            results = compute_with_dask(job, remaining, scheduler=scheduler, workers=at_once)
+            results = compute_with_dask(job, remaining, scheduler=options.scheduler, workers=at_once)
         errors = [record.error for record in folder.records()]
-        for stored in _watched(results, windows, remaining, errors, options.progress, folder.remove):
+        for frames, record in _watched(results, windows, remaining, errors, options.progress, folder.remove):
             # channels may be stored last
-            folder.add(stored.record, array=np.ascontiguousarray(np.stack(stored.frames)) if stored.frames else None)
-        out = out.with_frames(folder.written)
+            folder.add(record, array=np.ascontiguousarray(np.stack(frames)) if frames else None)
+        out = out.with_frames(sum(record.written for record in folder.records()))
         return {"not_kept": metadata_not_kept(job.info, sink, out.shape)}
 
     def stored(folder: RunFolder) -> Iterator[Array]:
@@ -199,7 +190,7 @@ def _watched(
         progress(done, total)
     with closing(results):
         for window, stored in zip(remaining, results, strict=True):
-            errors.append(stored.record.error)
+            errors.append(stored[1].error)
             if len(errors) >= min(_MAX_INITIAL_FAILURES, len(windows)) and all(errors):
                 fail()
                 raise ValueError(errors[0])

@@ -1,10 +1,10 @@
 """A run that writes an output from windows, and is resumed if it was interrupted.
 
-Finished windows are in a folder beside the output. A window consists of files of pixels and a line of the journal, with
-its record and the hashes of its files. The line is written when the files and their names are on the disk, so that a
-window with a line is finished. Every line begins with a hash of itself and of the line before: a journal that somebody
-has edited is refused. Files are opened relative to the open folder, and only new files are written: a link in the place
-of the folder or of a file is never followed, and nothing that others made is changed.
+Finished windows are in a folder beside the output: files of pixels, and a file with the record and the hashes of these
+files, which is written when they are on the disk. It begins with a hash of itself, whose key are the settings of the
+run: a window of another run, and one of which any file was changed, is not finished, and computed again. Files are
+opened relative to the open folder, and only new files are written: a link in the place of the folder or of a file is
+never followed, and nothing that others made is changed.
 """
 
 import errno
@@ -18,12 +18,12 @@ import shutil
 import stat
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import IO, Literal
+from typing import IO, Any, Literal
 
 import numpy as np
 
@@ -42,8 +42,9 @@ from rsvib_torch.stacks.manifest import StackManifest, read_manifest, stack_mani
 from rsvib_torch.stacks.windows import WindowRecord
 from rsvib_torch.text import number_of, one_line
 
-_JOURNAL = "journal"
-_NAMES = re.compile(rf"{_JOURNAL}|\d{{6,}}\.(npy|mkv|mp4|mov|m4v)")  # of the files that a run makes
+_SETTINGS = "settings.json"
+_RECORD = re.compile(r"\d{6,}\.json")
+_NAMES = re.compile(rf"{re.escape(_SETTINGS)}|\d{{6,}}\.(json|npy|mkv|mp4|mov|m4v)")  # of the files that a run makes
 _SAFELY = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # opening a named pipe must not wait for another process
 _blake2b = partial(hashlib.blake2b, digest_size=16)
 
@@ -56,11 +57,9 @@ def work_folder(sink: Path) -> Path:
 def _difference(old: object, new: object, path: str = "") -> str | None:
     """The first key in which two tables differ, with both values; None if they are equal."""
     if isinstance(old, dict) and isinstance(new, dict):
-        for key in dict.fromkeys([*new, *old]):
-            difference = _difference(old.get(key), new.get(key), f"{path}.{key}" if path else str(key))
-            if difference:
-                return difference
-        return None
+        keys = dict.fromkeys([*new, *old])
+        found = (_difference(old.get(key), new.get(key), f"{path}.{key}".lstrip(".")) for key in keys)
+        return next(filter(None, found), None)
     texts = (one_line(json.dumps(value), 60) for value in (old, new))
     return None if old == new else "{} was {}, now it is {}".format(path, *texts)
 
@@ -69,8 +68,8 @@ def check_space(path: Path, needed: int) -> None:
     """Raise an ``OSError`` if the disk of a file to be written has less than ``needed`` free bytes."""
     free = shutil.disk_usage(nearest_folder(path)).free
     if needed > free:
-        reason = f"{os.strerror(errno.ENOSPC)}: a run needs {size_text(needed)}, {size_text(free)} are free"
-        raise OSError(errno.ENOSPC, reason, str(path))
+        text = f"{os.strerror(errno.ENOSPC)}: a run needs {size_text(needed)}, {size_text(free)} are free"
+        raise OSError(f"{path}: {text}")
 
 
 class RunFolder:
@@ -82,20 +81,9 @@ class RunFolder:
 
     def __init__(self, sink: Path, header: Mapping[str, object], *, resume: bool) -> None:
         self.sink, self.path, self._above = sink, work_folder(sink), nearest_folder(sink)
-        self._windows: dict[int, bytes] = {}  # finished: record and hashes of the files as JSON
-        self._digest = b""  # of the last line of the journal
+        self._finished: dict[int, tuple[WindowRecord, list[str]]] = {}  # record and names of the files of windows
+        self._key = _blake2b(json.dumps(header, sort_keys=True).encode()).digest()
         atomic.make_folder(self.path.parent)
-        while not self._open():
-            pass
-        with ExitStack() as opened:
-            opened.callback(os.close, self._folder)
-            names = self._checked_names()
-            self._journal = opened.enter_context(self._file(_JOURNAL, "a+b"))
-            self._read_journal(dict(header), names, resume=resume)
-            self._opened = opened.pop_all()
-
-    def _open(self) -> bool:
-        """Open the folder, which is created if it does not exist, and lock it; False if it was removed meanwhile."""
         with ExitStack() as opened:
             try:
                 with suppress(FileExistsError):
@@ -103,24 +91,29 @@ class RunFolder:
                     sync(self.path.parent)
                 self._folder = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | _SAFELY)
                 opened.callback(os.close, self._folder)
-                if os.fstat(self._folder).st_uid != os.geteuid():
-                    raise self._refusal("it belongs to another user")
-                fcntl.flock(self._folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except FileNotFoundError:
-                return False
-            except BlockingIOError as error:
+                self._lock()
+            except (FileNotFoundError, BlockingIOError) as error:
                 raise BlockingIOError(f"cannot write {self.sink}: another run is writing it") from error
             except OSError as error:
-                if error.errno in (errno.ELOOP, errno.ENOTDIR):
-                    raise self._refusal("it is a link" if self.path.is_symlink() else "it is not a folder") from error
-                if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS):  # as those of some clusters
+                if error.errno not in (errno.ELOOP, errno.ENOTDIR):
                     raise
-                text = f"the file system has no locks ({error.strerror}): start no other run with this output"
-                warnings.warn(f"{self.path}: {text}", stacklevel=2)
-            keeps = self._has_its_name()  # otherwise another process has removed it
-            if keeps:
-                opened.pop_all()
-            return keeps
+                raise self._refusal("it is a link" if self.path.is_symlink() else "it is not a folder") from error
+            self._find_windows(header, resume=resume)
+            self._opened = opened.pop_all()
+
+    def _lock(self) -> None:
+        """Lock the folder, which must be that of this user; a ``BlockingIOError`` if another run uses it."""
+        if os.fstat(self._folder).st_uid != os.geteuid():
+            raise self._refusal("it belongs to another user")
+        try:
+            fcntl.flock(self._folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS):  # as those of some clusters
+                raise
+            text = f"the file system has no locks ({error.strerror}): start no other run with this output"
+            warnings.warn(f"{self.path}: {text}", stacklevel=2)
+        if not self._has_its_name():
+            raise BlockingIOError  # another run has just ended
 
     def _has_its_name(self) -> bool:
         with suppress(FileNotFoundError):
@@ -133,72 +126,54 @@ class RunFolder:
             f"delete {self.path} to start over"
         )
 
-    def _checked_names(self) -> list[str]:
-        """Names in the folder; a ``FileExistsError`` if there is anything in it that no run has made."""
+    def _find_windows(self, header: Mapping[str, object], *, resume: bool) -> None:
+        """Find the finished windows; an error if the folder has other files than those of a run, or of another run."""
         names = sorted(os.listdir(self._folder))
-        if names and _JOURNAL not in names:
-            raise self._refusal(f"it has no {_JOURNAL}")
         for name in names:
             status = os.stat(name, dir_fd=self._folder, follow_symlinks=False)
-            if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1 or status.st_uid != os.geteuid():
-                raise self._refusal("it is not a regular file of one name and of this user", name)
-            if not _NAMES.fullmatch(name):
-                raise self._refusal("it has another name than files of a run", name)
-        return names
+            if not (_NAMES.fullmatch(name) and stat.S_ISREG(status.st_mode)):
+                raise self._refusal("it has another name than files of a run, or is no regular file", name)
+        stored, records = self._content(_SETTINGS), list(filter(_RECORD.fullmatch, names))
+        if records and not resume:
+            raise FileExistsError(
+                f"{self.sink}: a run was interrupted here after {len(records)} windows; resume it (--resume), or "
+                f"delete {self.path} to start over"
+            )
+        difference = records and stored is not None and _difference(stored, dict(header))
+        if difference:
+            raise ValueError(f"{self.sink}: cannot resume: {difference}; delete {self.path} to start over")
+        for name in records:
+            entry = self._content(name, self._key)
+            with suppress(OSError):  # a file is missing, or cannot be read
+                if entry is not None and all(self._digest(file) == digest for file, digest in entry["files"].items()):
+                    record = decode(WindowRecord, entry["record"], name)
+                    if name == f"{record.window:06d}.json":
+                        self._finished[record.window] = record, list(entry["files"])
+        if stored != header:
+            self._write(_SETTINGS, header)
 
-    def _file(self, name: str, mode: Literal["rb", "x+b", "a+b"]) -> IO[bytes]:
+    def open(self, name: str, mode: Literal["rb", "x+b"] = "rb") -> IO[bytes]:
         """Open a file of the folder, wherever the folder is now, and never through a link."""
         return open(name, mode, opener=lambda name, flags: os.open(name, flags | _SAFELY, 0o600, dir_fd=self._folder))
 
-    def _read_journal(self, header: Table, names: Iterable[str], *, resume: bool) -> None:
-        """Find the windows whose files are as they were written; a journal without windows begins anew."""
-        start_over = f"delete {self.path} to start over"
-        damaged = ValueError(f"{self.path / _JOURNAL} is damaged; {start_over}")
-        stored, end = None, 0
-        self._journal.seek(0)
-        for line in self._journal:
-            if not line.endswith(b"\n") or b"\0" in line:  # it was not yet on the disk
-                break
-            digest, _, body = line[:-1].partition(b" ")
-            if digest != _keyed(body, self._digest):
-                raise damaged
-            if end == 0:
-                stored = json.loads(body)
-            else:
-                self._windows[json.loads(body)["record"]["window"]] = body
-            self._digest, end = digest, end + len(line)
-        if end == 0 and set(names) > {_JOURNAL}:
-            raise damaged
-        if not self._windows:
-            end, self._digest = 0, b""
-        elif not resume:
-            raise FileExistsError(
-                f"{self.sink}: a run was interrupted here after {self.count} windows; resume it (--resume), or "
-                f"{start_over}"
-            )
-        elif difference := _difference(stored, header):
-            raise ValueError(f"{self.sink}: cannot resume: {difference}; {start_over}")
-        self._journal.truncate(end)
-        if not self._windows:
-            self._append(header)
-            os.fsync(self._folder)
-        for window, body in list(self._windows.items()):
-            whole = False  # whether its files are those that were written
-            with suppress(OSError):
-                whole = all(self._digest_of(name) == digest for name, digest in json.loads(body)["files"].items())
-            if not whole:
-                del self._windows[window]
+    def _write(self, name: str, content: Mapping[str, object], key: bytes = b"") -> None:
+        """Write a table with its hash; it is on the disk when the function returns."""
+        body = json.dumps(content).encode()
+        with self.create(name) as file:
+            file.write(_blake2b(body, key=key).hexdigest().encode() + b" " + body)
+            file.flush()
+            os.fsync(file.fileno())
+        os.fsync(self._folder)
 
-    def _append(self, entry: Mapping[str, object]) -> bytes:
-        """Write a line of the journal, which is on the disk when the function returns, and return it as JSON."""
-        body = json.dumps(entry).encode()
-        self._digest = _keyed(body, self._digest)
-        self._journal.write(self._digest + b" " + body + b"\n")
-        self._journal.flush()
-        os.fsync(self._journal.fileno())
-        return body
+    def _content(self, name: str, key: bytes = b"") -> Any:
+        """The table in a file; None if the file is not as it was written, or with another key."""
+        with suppress(OSError), self.open(name) as file:
+            digest, _, body = file.read().partition(b" ")
+            if digest == _blake2b(body, key=key).hexdigest().encode():
+                return json.loads(body)
+        return None
 
-    def _digest_of(self, name: str, *, synchronised: bool = False) -> str:
+    def _digest(self, name: str, *, synchronised: bool = False) -> str:
         with self.open(name) as file:
             if synchronised:
                 os.fsync(file.fileno())
@@ -208,11 +183,7 @@ class RunFolder:
         """A new file of a window, whose name begins with the number of the window in six digits."""
         with suppress(FileNotFoundError):
             os.unlink(name, dir_fd=self._folder)
-        return self._file(name, "x+b")
-
-    def open(self, name: str) -> IO[bytes]:
-        """A file of the folder for reading."""
-        return self._file(name, "rb")
+        return self.open(name, "x+b")
 
     def add(self, record: WindowRecord, names: Sequence[str] = (), array: Array | None = None) -> None:
         """Enter the record of a window with its closed files, and an array, which becomes the last of them.
@@ -220,39 +191,31 @@ class RunFolder:
         It is on the disk when the function returns.
         """
         names = list(names)
-        with disk_errors_named(self):
-            if array is not None:
-                names.append(f"{record.window:06d}.npy")
-                with self.create(names[-1]) as file:
-                    np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(array))
-                    file.write(array.data)  # errors of np.save do not contain the reason
-            digests = {name: self._digest_of(name, synchronised=True) for name in names}
-            os.fsync(self._folder)  # their names
-            self._windows[record.window] = self._append({"record": plain_values(record), "files": digests})
+        if array is not None:
+            names.append(f"{record.window:06d}.npy")
+            with self.create(names[-1]) as file:
+                np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(array))
+                file.write(array.data)  # errors of np.save do not contain the reason
+        digests = {name: self._digest(name, synchronised=True) for name in names}
+        content = {"record": plain_values(record), "files": digests}
+        self._write(f"{record.window:06d}.json", content, self._key)
+        self._finished[record.window] = record, names
 
     def __contains__(self, window: int) -> bool:
-        return window in self._windows
+        return window in self._finished
 
-    @property
-    def count(self) -> int:
-        """Number of finished windows."""
-        return len(self._windows)
+    def kept(self) -> str:
+        """What an error of the run states about its finished windows."""
+        count = len(self._finished)
+        return f"; {count} windows are complete, resume the run to continue" if count else ""
 
-    @property
-    def written(self) -> int:
-        """Number of their frames."""
-        return sum(entry["record"]["written"] for entry in self._entries())
-
-    def _entries(self) -> Iterator[Table]:
-        return (json.loads(self._windows[window]) for window in sorted(self._windows))
-
-    def records(self) -> Iterator[WindowRecord]:
+    def records(self) -> list[WindowRecord]:
         """Records of the finished windows in order."""
-        return (decode(WindowRecord, entry["record"], _JOURNAL) for entry in self._entries())
+        return [self._finished[window][0] for window in sorted(self._finished)]
 
-    def files(self) -> Iterator[str]:
+    def files(self) -> list[str]:
         """Names of the files of the finished windows in order."""
-        return (name for entry in self._entries() for name in entry["files"])
+        return [name for window in sorted(self._finished) for name in self._finished[window][1]]
 
     def remove(self) -> None:
         """Remove the folder, and the empty folders above it that were created for it.
@@ -260,7 +223,7 @@ class RunFolder:
         It is renamed first: if the process is killed meanwhile, ``temporary_folder`` removes the rest later.
         """
         hidden = self.path.with_name(f".{self.sink.name}.{secrets.token_hex(4)}{atomic.PART}")
-        self._windows.clear()
+        self._finished.clear()
         if self._has_its_name():
             self.path.rename(hidden)
             sync(hidden.parent)
@@ -274,28 +237,8 @@ class RunFolder:
     def close(self) -> None:
         """Release the folder; it is removed if it contains no finished window."""
         with self._opened:
-            if not self._windows:
+            if not self._finished:
                 self.remove()
-
-
-def _keyed(body: bytes, key: bytes) -> bytes:
-    """Digest of a line of the journal; the key is that of the line before."""
-    return _blake2b(body, key=key).hexdigest().encode()
-
-
-@contextmanager
-def disk_errors_named(folder: RunFolder) -> Iterator[None]:
-    """Add the name of the output and the number of finished windows to errors of the disk."""
-    try:
-        yield
-    except (OSError, RuntimeError) as error:
-        number = atomic.error_of_full_disk(error) or getattr(error, "errno", None)
-        if number is None and not isinstance(error, OSError):
-            raise
-        kept = f"; {folder.count} windows are complete, resume the run to continue" if folder.count else ""
-        # the words of the system: libraries add long descriptions
-        reason = os.strerror(number) if number else " ".join(str(error).split())
-        raise OSError(number, f"{reason}{kept}", str(folder.sink)) from error
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -365,6 +308,7 @@ def run_to_file(
     output from the folder.
     """
     start = time.perf_counter()
+    header = json.loads(json.dumps(header))  # lists instead of tuples, as in files
     path = sink.with_name(f"{sink.name}.manifest.json") if options.manifest is None else Path(options.manifest)
     check_outputs([*stack_files(sink), work_folder(sink), path], inputs)
 
@@ -391,18 +335,14 @@ def run_to_file(
         for written in (sink, path):
             atomic.remove_abandoned(written)
         return report(complete, len(complete.windows))
-    folder = RunFolder(sink, header, resume=options.resume)
-    try:
-        resumed = folder.count
+    with closing(RunFolder(sink, header, resume=options.resume)) as folder, atomic.full_disk_named(sink, folder.kept):
+        resumed = len(folder.records())
         results = compute(folder)
-        with disk_errors_named(folder):
-            atomic.make_folder(path.parent)
-            manifest = stack_manifest(header, folder.records(), **results)
-            with atomic.whole_file(path) as part:
-                manifest.save(part)
-                write(folder)
-            sync(path.absolute().parent)  # the temporary folder is gone as well
+        atomic.make_folder(path.parent)
+        manifest = stack_manifest(header, folder.records(), **results)
+        with atomic.whole_file(path) as part:
+            manifest.save(part)
+            write(folder)
+        sync(path.absolute().parent)  # the temporary folder is gone as well
         folder.remove()
         return report(manifest, resumed)
-    finally:
-        folder.close()

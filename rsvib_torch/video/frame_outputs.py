@@ -1,6 +1,5 @@
-"""Outputs of video frames: files, pipes, and a page for browsers on this machine (motion JPEG)."""
+"""Outputs of video frames: files, pipes, and a page for browsers on this machine."""
 
-import html
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -24,12 +23,14 @@ Frame = NDArray[np.uint8]  # (H, W) grey or (H, W, 3) RGB
 _FRAGMENTS = {"flush_packets": "1", "movflags": "frag_every_frame+empty_moov+default_base_moof"}
 _CLUSTERS = {"flush_packets": "1", "cluster_time_limit": "0"}  # ms
 _HOST = "127.0.0.1"  # never reachable from other machines
-_BOUNDARY = "rsvib-frame"
+# the next frame is requested when one is shown: a slow browser gets fewer of them
 _PAGE = """<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>rsvib live</title>
-<style>body{{font-family:sans-serif;margin:1em}}img{{max-width:100%}}pre{{background:#f4f4f4;padding:.6em}}</style>
-</head><body><h1>rsvib live</h1><img src="/frames" alt="restored frames"><pre id="state">{state}</pre>
-<script>setInterval(async () => {{document.getElementById("state").textContent =
-await (await fetch("/state")).text()}}, 500)</script></body></html>"""
+<style>body{font-family:sans-serif;margin:1em}img{max-width:100%}pre{background:#f4f4f4;padding:.6em}</style>
+</head><body><h1>rsvib live</h1><img id="frame" alt="restored frames"><pre id="state"></pre>
+<script>const image = document.getElementById("frame"), text = document.getElementById("state");
+const next = () => {image.src = "/frame?" + Date.now()};
+image.onload = () => setTimeout(next, 20); image.onerror = () => setTimeout(next, 500); next();
+setInterval(async () => {text.textContent = await (await fetch("/state")).text()}, 500)</script></body></html>"""
 
 
 class FrameOutput(Protocol):
@@ -120,8 +121,8 @@ class PageOutput:
     """Restored frames at ``http://127.0.0.1:PORT``; the port 0 chooses a free one. ``url`` is the address."""
 
     def __init__(self, port: int) -> None:
-        self._changed, self._frame, self._number, self._open = threading.Condition(), b"", 0, True
-        self._viewers, self._state = 0, "waiting for frames"
+        self._frame: Frame | None = None  # the last one; it is encoded when a browser asks for it
+        self._state = "waiting for frames"
         output = self
 
         class Handler(BaseHTTPRequestHandler):
@@ -131,22 +132,25 @@ class PageOutput:
 
             def do_GET(self) -> None:
                 """Answer a request."""
+                name = self.path.partition("?")[0]
                 if self.headers.get("Host", "").rpartition(":")[0] not in (_HOST, "localhost"):
                     self.send_error(403, f"the page is at {output.url}")  # another site refers to this machine
-                elif self.path == "/frames":
-                    output._send_frames(self)
-                elif self.path in ("/", "/state"):
-                    state = output._state
-                    text = state if self.path == "/state" else _PAGE.format(state=html.escape(state))
-                    kind = "text/plain" if self.path == "/state" else "text/html"
-                    data = text.encode()
-                    self.send_response(200)
-                    self.send_header("Content-Type", f"{kind}; charset=utf-8")
-                    self.send_header("Content-Length", str(len(data)))
-                    self.end_headers()
-                    self.wfile.write(data)
+                elif name == "/":
+                    self._send("text/html; charset=utf-8", _PAGE.encode())
+                elif name == "/state":
+                    self._send("text/plain; charset=utf-8", output._state.encode())
+                elif name == "/frame" and output._frame is not None:
+                    self._send("image/jpeg", _jpeg(output._frame))
                 else:
                     self.send_error(404)
+
+            def _send(self, kind: str, data: bytes) -> None:
+                self.send_response(200)
+                self.send_header("Content-Type", kind)
+                self.send_header("Content-Length", str(len(data)))
+                self.end_headers()
+                with suppress(OSError):  # the browser has left
+                    self.wfile.write(data)
 
             def log_message(self, *_: Any) -> None:
                 """Requests are not printed."""
@@ -157,46 +161,22 @@ class PageOutput:
             raise OSError(f"--page {port}: {error}; choose another port") from error
         self._server.daemon_threads = True
         self.url = f"http://{_HOST}:{self._server.server_address[1]}/"
-        self._thread = threading.Thread(target=self._server.serve_forever, name="rsvib-page", daemon=True)
-        self._thread.start()
+        threading.Thread(target=self._server.serve_forever, name="rsvib-page", daemon=True).start()
 
     def show_state(self, text: str) -> None:
         """Show a text below the frames."""
         self._state = text
 
     def write(self, frame: Frame, index: int) -> None:
-        """Show a frame; it is encoded if a browser shows the page."""
-        if self._viewers == 0:
-            return
-        colours = frame if frame.ndim == 2 else np.ascontiguousarray(frame[..., ::-1])
-        data = cv2.imencode(".jpg", colours, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
-        with self._changed:
-            self._frame, self._number = data, self._number + 1
-            self._changed.notify_all()
-
-    def _send_frames(self, request: BaseHTTPRequestHandler) -> None:
-        """Send frames until the browser leaves; a slow browser gets fewer of them."""
-        request.send_response(200)
-        request.send_header("Content-Type", f"multipart/x-mixed-replace; boundary={_BOUNDARY}")
-        request.end_headers()
-        self._viewers, sent = self._viewers + 1, 0
-        try:
-            while self._open:
-                with self._changed:
-                    while self._number == sent and self._open:
-                        self._changed.wait(1.0)
-                    data, sent = self._frame, self._number
-                head = f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
-                request.wfile.write(head.encode() + data + b"\r\n")
-        except OSError:
-            pass  # the browser has left
-        finally:
-            self._viewers -= 1
+        """Show a frame."""
+        self._frame = frame
 
     def close(self) -> None:
         """End the page."""
-        with self._changed:
-            self._open = False
-            self._changed.notify_all()
         self._server.shutdown()
         self._server.server_close()
+
+
+def _jpeg(frame: Frame) -> bytes:
+    colours = frame if frame.ndim == 2 else np.ascontiguousarray(frame[..., ::-1])
+    return cv2.imencode(".jpg", colours, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()

@@ -1,7 +1,7 @@
 """Videos from file to file, followed from frame to frame: ``process_video``."""
 
 from collections.abc import Callable, Generator, Iterator
-from contextlib import ExitStack, closing
+from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from itertools import chain, count, groupby, islice
 from pathlib import Path
@@ -31,12 +31,7 @@ from rsvib_torch.results.presentation import plain_values
 from rsvib_torch.stacks.heap import share_one_heap
 from rsvib_torch.stacks.job import plan_job, single_frame_options
 from rsvib_torch.stacks.manifest import fingerprint, manifest_header, rms_shaking
-from rsvib_torch.stacks.run_folder import (
-    RunFolder,
-    StackReport,
-    disk_errors_named,
-    run_to_file,
-)
+from rsvib_torch.stacks.run_folder import RunFolder, StackReport, run_to_file
 from rsvib_torch.video import Margins
 from rsvib_torch.video.video_frames import Frame, FrameTrack, VideoFrames
 from rsvib_torch.video.video_passes import PART_FRAMES, VideoMotion, VideoPasses
@@ -240,7 +235,7 @@ class _SecondPass:
     def run(self, at_once: int) -> None:
         """Restore a number of frames at the same time."""
         share_one_heap()
-        threads = 1 if self.video.frames.job.device == "cpu" else torch.get_num_threads()
+        threads = 1 if self.video.frames.job.options.device == "cpu" else torch.get_num_threads()
         with closing(in_threads(self._restored, self._missing(), at_once=at_once, threads=threads)) as frames:
             for part, of_part in groupby(frames, lambda one: one[0].index // PART_FRAMES):
                 self._encode(part, of_part)
@@ -277,10 +272,7 @@ class _SecondPass:
         if part > 0:
             with folder.open(f"{part - 1:06d}.npy") as file:
                 before = layout.planes(np.load(file, allow_pickle=False))
-        with ExitStack() as opened:
-            with disk_errors_named(folder):
-                encoded = part_of_video(folder.create(name), folder.sink, self.info, layout.picture)
-                write = opened.enter_context(encoded)
+        with part_of_video(folder.create(name), folder.sink, self.info, layout.picture) as write:
             for track, planes, visible in frames:
                 if tracks:
                     self.progress()  # the frame before is complete
@@ -290,11 +282,8 @@ class _SecondPass:
                     before = planes
                 else:  # hidden pixels are held
                     before = [np.where(*one) for one in zip(visible, planes, before, strict=True)]
-                with disk_errors_named(folder):
-                    write(layout.frame(_cut(before, self.margins)))
+                write(layout.frame(_cut(before, self.margins)))
                 tracks.append(track)
-            with disk_errors_named(folder):
-                opened.close()  # the file is complete
         assert before is not None
         record = self.video.record(part, tracks, self.motion, self.verdicts[part])
         folder.add(record, [name], np.ascontiguousarray(layout.frame(before)))

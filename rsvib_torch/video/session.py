@@ -43,7 +43,6 @@ class LiveReport:
     # number of frames by their delay: how many frames had arrived behind it when a frame was written
     latencies: list[int] = field(default_factory=lambda: [0] * (_LATENCY_COUNTS + 1))
     detection: DetectionResult | None = None  # the last vibration
-    size: tuple[int, int] | None = None  # (height, width) of the written frames
 
     def latency(self, share: float) -> int:
         """Delay in frames that ``share`` (0 to 1) of the frames do not exceed."""
@@ -114,7 +113,7 @@ def run_live(
             frame, index = to_counts(border(tracked)), max(index + 1, round(tracked.time / period))
             for output in outputs:
                 output.write(frame, index)
-            last, report.size = tracked, frame.shape[:2]
+            last = tracked
             report.frames += 1
             late = math.floor((time.perf_counter() - arrived) / period)
             report.latencies[min(late, _LATENCY_COUNTS)] += 1

@@ -73,7 +73,7 @@ class VideoFrames:
     @property
     def full_scale(self) -> float | None:
         """Count that corresponds to 1.0; None for floats."""
-        return self.job.full_scale if self.picture is None else 255.0
+        return self.job.options.full_scale if self.picture is None else 255.0
 
     def luma(self, frame: Frame) -> Frame:
         """The part of a frame in which motion is measured."""
@@ -166,7 +166,7 @@ class VideoFrames:
 
     def _without_vibration(self, plane: Frame, timing: SensorTiming, motion: Vibration) -> Frame:
         scale, options = self.full_scale, self.job.chosen
-        images: Tensor = counts_to_frames(plane[None], scale, "the video").to(self.job.device)
+        images: Tensor = counts_to_frames(plane[None], scale, "the video").to(self.job.options.device)
         saturation = options.saturation if isinstance(options.saturation, float) else None
         if saturation is not None and self.picture is not None:
             black, white = self.picture.levels

@@ -229,7 +229,7 @@ class VideoPasses:
         if not (isinstance(undone, Vibration) and isinstance(later, Vibration)):
             return None
         pixels = np.stack([self.frames.luma(one), self.frames.luma(other)])
-        images = counts_to_frames(pixels, self.frames.full_scale, "the video").to(self.frames.job.device)
+        images = counts_to_frames(pixels, self.frames.full_scale, "the video").to(self.frames.job.options.device)
         # The path in both frames and between them: extrapolated from the first frame, a hand was wrong by 0.9 px.
         axes = min(undone.num_axes, later.num_axes)
         undone = undone if axes == undone.num_axes else undone.translation()

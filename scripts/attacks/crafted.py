@@ -14,10 +14,11 @@ import av
 import h5py
 import numpy as np
 import zarr
-from attacks.files import TIMING, write_tiff
+from attacks.files import write_tiff
 from attacks.trial import Trial
 from attacks.warm import in_warm_child
 from PIL import Image
+from small_stack import TIMING
 
 import rsvib_torch as rsv
 from rsvib_torch.config import read_config

@@ -1,100 +1,72 @@
 """Full and read-only disks: a one-line error, no incomplete output, and the run can be resumed when there is space.
 
-The runs are in a process with a mount namespace of its own; without the right to mount file systems there are no
+The runs are in processes that see a small file system of their own; without the right to mount one, there are no
 trials.
 """
 
-import json
+import ctypes
 import os
-import shutil
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-import torch
-from attacks.small_runs import content
+from attacks.small_runs import FORMATS, Reference, fork, process, resume
 from attacks.trial import Trial
-from small_stack import process_small, write_small
 
 _PAGE = 4096
-# of 4 KiB that are left, 0: read-only; windows and output have 55 to 60 each
-_PAGES = (0, 2, 9, 20, 37, 52, 58, 70, 106, 114, 125)
+_PAGES = (0, 1, 5, 10, 16, 24, 32, 40, 50, 60, 110)  # of 4 KiB that are left, 0: read-only; a run needs 50 to 80
+_NEW_MOUNTS, _NEW_USER = 0x20000, 0x10000000  # of unshare(2)
 
 
-def _unshare() -> list[str] | None:
-    if shutil.which("unshare") is None:
-        return None
-    for options in ("-m", "-rm"):
-        command = ["unshare", options, "sh", "-c"]
-        mount = [*command, "mount -t tmpfs -o size=64k none /mnt"]
-        if subprocess.run(mount, capture_output=True, check=False).returncode == 0:
-            return command
-    return None
+def _mount(disk: Path) -> None:
+    """Mount a file system of 1 MB that only this process and its children see."""
+    user = os.geteuid()
+    ctypes.CDLL(None).unshare(_NEW_MOUNTS | (_NEW_USER if user else 0))
+    if user:
+        Path("/proc/self/uid_map").write_text(f"0 {user} 1")
+    disk.mkdir(exist_ok=True)
+    for arguments in (("--make-rprivate", "/"), ("-t", "tmpfs", "-o", "size=1m,mode=755", "none", disk)):
+        subprocess.run(["mount", *arguments], check=True, capture_output=True)
 
 
-def _free_pages(folder: Path) -> int:
-    disk = os.statvfs(folder)
-    return disk.f_bavail * disk.f_frsize // _PAGE
-
-
-def _attempt(source: Path, whole: Path, disk: Path, name: str, pages: int) -> dict[str, Any]:
-    """Message of a run with a number of free pages, whether it has an output, and whether it is right once resumed."""
-    with (disk / "ballast").open("wb") as file:
-        file.write(b"b" * (_PAGE * (_free_pages(disk) - pages)))
-    assert abs(_free_pages(disk) - pages) <= 1
+def _attempt(reference: Reference, disk: Path, kind: str, pages: int) -> str:
+    """Message of a run with a number of free pages; resumed when there is space, its result must be right."""
+    _mount(disk)
+    name, options = FORMATS[kind]
+    sink, ballast, free = disk / "new" / name, disk / "ballast", os.statvfs(disk).f_bavail
+    ballast.write_bytes(b"b" * (_PAGE * (free - pages)))
+    assert abs(os.statvfs(disk).f_bavail - pages) <= 1
     if pages == 0:
         subprocess.run(["mount", "-o", "remount,ro", disk], check=True)
-    message, new = "done", disk / "new"
+    message = ""
     try:
-        process_small(source, new / name)
+        process(reference.source, sink, **options)
     except OSError as error:
         message = str(error)
-    exists = (new / name).exists()
+    assert not (message and sink.exists()), "an incomplete output has its name"
     if pages == 0:
         subprocess.run(["mount", "-o", "remount,rw", disk], check=True)
-    (disk / "ballast").unlink()
-    process_small(source, new / name, resume=True)
-    same = content(new / name) == content(whole / name)
-    shutil.rmtree(new)
-    return {"message": message, "output_exists": exists, "same": same}
+    ballast.unlink()
+    resume(reference.source, sink, options)
+    difference = reference.difference(sink.parent, name)
+    assert not difference, difference
+    return message
 
 
 def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
     """All formats, on a read-only disk and on disks with different numbers of free pages."""
-    mount = _unshare()
-    if mount is None:
+    reference, disk = Reference(folder / "reference"), folder / "disk"
+    if fork(_mount, disk)[0] != 0:
         return
-    names = ("out.tif", "out.zarr", "out.h5", "out.raw", "frames", "out.npy")
-    wanted = [(name, pages) for pages in _PAGES for name in names][:count]
-    source, whole, disk = folder / "frames.tif", folder / "whole", folder / "disk"
-    whole.mkdir()
-    disk.mkdir()
-    write_small(source)
-    for name in names:
-        process_small(source, whole / name)
-    shell = f'mount -t tmpfs -o size=1m,mode=755 none "{disk}" && exec "$@"'
-    program = [sys.executable, "-m", "attacks.disks", str(source), str(whole), str(disk), json.dumps(wanted)]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    done = subprocess.run([*mount, shell, "sh", *program], capture_output=True, text=True, check=False, env=environment)
-    if done.returncode != 0:
-        yield Trial("full disk", "traceback", done.stderr[-2000:])
-        return
-    for (name, pages), run in zip(wanted, json.loads(done.stdout.splitlines()[-1]), strict=True):
-        title, message = f"{name}: {f'{pages} pages left' if pages else 'read-only disk'}", run["message"]
+    wanted = [(kind, pages) for pages in _PAGES for kind in FORMATS]
+    for kind, pages in wanted[:: max(1, len(wanted) // count)][:count]:
+        title = f"{kind}: {f'{pages} pages left' if pages else 'read-only disk'}"
+        code, result = fork(_attempt, reference, disk, kind, pages)
         expected = "No space left on device" if pages else "Read-only file system"
-        if not run["same"]:
-            yield Trial(title, "wrong", "the resumed output differs")
-        elif message == "done":
+        if code != 0:
+            yield Trial(title, "hang" if code is None else "wrong", str(result))
+        elif not result:
             yield Trial(title, "completed" if pages else "wrong")
-        elif "\n" in message or expected not in message:
-            yield Trial(title, "traceback", message)
         else:
-            yield Trial(title, "lost" if run["output_exists"] else "refused", message)
-
-
-if __name__ == "__main__":
-    torch.set_num_threads(1)
-    places = [Path(text) for text in sys.argv[1:4]]
-    print(json.dumps([_attempt(*places, *trial) for trial in json.loads(sys.argv[4])]))
+            is_clear = "\n" not in result and expected in result
+            yield Trial(title, "refused" if is_clear else "traceback", str(result))

@@ -11,13 +11,13 @@ import tifffile
 import torch
 import zarr
 from numpy.typing import NDArray
+from small_stack import OPTIONS
 
 import rsvib_torch as rsv
 
 Counts = NDArray[np.uint16]
-TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=104)
-BANDS: dict[str, Any] = {"band_rows": 16, "band_step": 8, "search": 6}
-DETECTION: dict[str, Any] = {"method": "bands", "tones": 1, **BANDS}
+DETECTION: dict[str, Any] = OPTIONS["detection"]
+BANDS: dict[str, Any] = {name: DETECTION[name] for name in ("band_rows", "band_step", "search")}
 FULL_SCALE = 4095
 _AT_ONCE = 8  # simulated frames; of 64 frames of 512 x 512 px the spectra need 1 GB
 

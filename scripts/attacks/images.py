@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from attacks.files import TIMING
 from attacks.trial import Trial
 from attacks.warm import in_warm_child
+from small_stack import TIMING
 from torch import Tensor
 
 import rsvib_torch as rsv

@@ -11,16 +11,12 @@ import tifffile
 from attacks.files import write_stack
 from attacks.small_runs import Reference, completed_or_refused, content, fork, process
 from attacks.trial import Trial
+from small_stack import CAMERA
 
 import rsvib_torch as rsv
 from rsvib_torch.commands.main import run_command
 
-_CAMERA = """
-[sensor]
-row_time = 1e-4
-exposure_rows = 6
-frame_rows = 72
-full_scale = 4095
+_SIMULATION = """
 [simulation]
 num_frames = 2
 frame_size = [48, 48]
@@ -37,33 +33,20 @@ def _write_originals(folder: Path, source: Path) -> None:
     for name in ("frames.tif", "pngs", "frames.zarr", "frames.raw", "frames.npy", "frames.h5", "frames.mkv"):
         write_stack(folder / name, counts)
     write_stack(folder / "scene.png", counts[:1])
-    (folder / "camera.toml").write_text(_CAMERA)
+    (folder / "camera.toml").write_text(CAMERA + _SIMULATION)
     times = "\n".join(f"{0.001 * index},0.1,0.2" for index in range(100))
     (folder / "motion.csv").write_text(f"time,x,y\n{times}\n")
     shutil.copy(source.with_name("vibrations.json"), folder / "vibrations.json")
 
 
 def _aliases(original: Path, *, ending: str = "") -> dict[str, Path]:
-    """Names of an output that are the original, or lie in it; links are made."""
-    ending = ending or original.suffix
-    names = {"itself": original, "another path": original.parent / "pngs" / ".." / original.name}
-    link = original.with_name(f"link{ending}")
-    link.symlink_to(original.name)
-    names["a link"] = link
-    around = original.with_name("around")
-    around.symlink_to(".")
-    names["a path with a link"] = around / original.name
-    if original.is_file():
-        hard = original.with_name(f"hard{ending}")
-        os.link(original, hard)
-        names["a hard link"] = hard
-    else:
-        names["a file in it"] = original / "restored.tif"
-        names["a folder in it"] = original / "deep" / "out"
-        inner = original.with_name("inner")
-        inner.symlink_to(original.name)
-        names["a file in it by a link"] = inner / "restored.tif"
-    return names
+    """Names of an output that are the original, or lie in it; tests/files/test_outputs.py has more of them."""
+    if original.is_dir():
+        return {"itself": original, "a file in it": original / "restored.tif", "a folder in it": original / "deep/out"}
+    hard = original.with_name(f"hard{ending or original.suffix}")
+    hard.unlink(missing_ok=True)
+    os.link(original, hard)
+    return {"itself": original, "a hard link": hard}
 
 
 def _command(arguments: list[str]) -> None:
@@ -88,7 +71,7 @@ def _processed(place: Path, output: Path, manifest: Path | None) -> None:
 
 
 def _attempts(place: Path) -> Iterator[tuple[str, Callable[..., None], tuple[object, ...]]]:
-    """All trials: title, function and arguments; links are made in ``place``."""
+    """All trials: title, function and arguments; hard links are made in ``place``."""
     config = ["--config", str(place / "camera.toml"), "--overwrite"]
     vibration = ["--vibration", str(place / "vibrations.json")]
     known = ["--motion", str(place / "motion.csv"), "--unit", "px", "--offset", "0"]
@@ -104,7 +87,6 @@ def _attempts(place: Path) -> Iterator[tuple[str, Callable[..., None], tuple[obj
             yield command(f"known {stack}: {alias}", "known", source, output, *config, *known)
             yield f"process_stack {stack}: {alias}", _processed, (source, output, None)
             yield f"write_stack like {stack}: {alias}", _written, (str(source), str(output))
-        _remove_links(place)
     folders = {"the input": place / "pngs", "a folder in it": place / "pngs" / "out", "the folder of it": place}
     for alias, out in folders.items():
         yield command(f"run pngs: {alias}", "run", place / "pngs", out, *config)
@@ -116,7 +98,6 @@ def _attempts(place: Path) -> Iterator[tuple[str, Callable[..., None], tuple[obj
         yield command(f"run {stack}: --output is the input", "run", *arguments)
     for alias, output in _aliases(place / "scene.png").items():
         yield command(f"simulate: {alias}", "simulate", place / "scene.png", output, *config)
-    _remove_links(place)
     for stack in ("frames.tif", "pngs"):
         for alias, output in _aliases(place / stack, ending=".csv").items():
             yield command(f"motion: {alias}", "motion", place / stack, "--out", output, *config)
@@ -124,7 +105,6 @@ def _attempts(place: Path) -> Iterator[tuple[str, Callable[..., None], tuple[obj
             yield command(f"calibrate: {alias}", "calibrate", place / stack, *light)
             camera = ("--row-time", "1e-4", "--exposure", "6e-4", "--frame-rate", 130, "--out", output, config[2])
             yield command(f"init: {alias}", "init", place / stack, *camera)
-        _remove_links(place)
     good = (place / "frames.tif", place / "restored.tif")
     reports = ("frames.tif", "camera.toml", "vibrations.json", "restored.tif", "pngs/../restored.tif")
     for name in reports:
@@ -132,7 +112,6 @@ def _attempts(place: Path) -> Iterator[tuple[str, Callable[..., None], tuple[obj
         yield command(f"restore --report {name}", "restore", *good, *config, *vibration, *report)
     for alias, output in _aliases(place / "camera.toml").items():
         yield command(f"motion: camera.toml, {alias}", "motion", place / "frames.tif", "--out", output, *config)
-    _remove_links(place)
     for manifest in ("frames.tif", "restored.tif", "pngs/manifest.json"):
         source = place / ("pngs" if manifest.startswith("pngs") else "frames.tif")
         yield f"process_stack: manifest {manifest}", _processed, (source, place / "restored.tif", place / manifest)
@@ -144,12 +123,6 @@ def _attempts(place: Path) -> Iterator[tuple[str, Callable[..., None], tuple[obj
     inside = place / "tree.zarr" / "frames.tif"
     yield command("known: folder around the input", "known", inside, place / "tree.zarr", *config, *known)
     yield "process_stack: folder around the input", _processed, (inside, place / "tree.zarr", None)
-
-
-def _remove_links(place: Path) -> None:
-    for path in list(place.iterdir()):
-        if path.is_symlink() or path.name.startswith("hard"):
-            path.unlink()
 
 
 def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:

@@ -239,40 +239,6 @@ def _before_the_first_frame(name: str, out: Path, frames: int) -> Trial:
         return _judged(name, session, process, least=0, expected="refused", message="no frame was read")
 
 
-def _created_during_the_session(name: str, out: Path, frames: int) -> Trial:
-    """Another program creates a file of that name before the first frame."""
-    with _camera() as camera:
-        session = _start(camera.url, out)
-        camera.viewers.acquire(timeout=_LIMIT)
-        out.write_bytes(b"of another program")
-        camera.begin.set()
-        process = session.ended()
-        if out.read_bytes() != b"of another program":
-            return Trial(name, "lost", "the file was replaced")
-        return _judged(name, session, process, least=0, expected="refused", message=str(out))
-
-
-def _same_name(name: str, out: Path, frames: int) -> Trial:
-    """Two sessions with one name: one records, the other one is refused."""
-    with _camera() as camera:
-        sessions = [_start(camera.url, out), _start(camera.url, out)]
-        for _ in sessions:
-            camera.viewers.acquire(timeout=_LIMIT)
-        camera.begin.set()
-        end = time.monotonic() + _LIMIT
-        while all(session.child.poll() is None for session in sessions) and time.monotonic() < end:
-            time.sleep(0.1)
-        recording = [session for session in sessions if session.child.poll() is None]
-        count = max((session.recorded(frames) for session in recording), default=0)
-        for session in recording:
-            session.send(signal.SIGTERM)
-        outcomes = [outcome_of_command(session.ended()) for session in sessions]
-        if len(recording) != 1 or sorted(outcomes) != ["completed", "refused"]:
-            return Trial(name, "lost", f"{len(recording)} sessions record to one file: {outcomes}")
-        process = recording[0].ended()
-        return _judged(name, recording[0], process, least=max(count, frames), expected="completed")
-
-
 def _pipe(name: str, out: Path, frames: int, *, reader_ends: bool) -> Trial:
     """Raw frames from an open pipe to a reader, which ends, or which reads no more while SIGTERM arrives."""
     command = rsvib("live", "-", *_CAMERA, "--size", f"{_SIZE}x{_SIZE}", "--out", "-")
@@ -302,7 +268,6 @@ _WAYS: dict[str, Callable[[str, Path, int], Trial]] = {
     "full disk": _Ending(_Session.fill_disk, "refused", "{out}: File too large"),
     "answer into a closed pipe": _Ending(_without_reader, "refused", "the answer cannot be written", "pipe"),
     "SIGINT before the first frame": _before_the_first_frame,
-    "two sessions with one name": _same_name,
     "SIGINT": _Ending(_signals(signal.SIGINT)),
     "SIGHUP": _Ending(_signals(signal.SIGHUP)),
     "SIGINT twice": _Ending(_signals(signal.SIGINT, signal.SIGINT)),
@@ -311,7 +276,6 @@ _WAYS: dict[str, Callable[[str, Path, int], Trial]] = {
     "SIGKILL": _killed,
     "the camera disappears": partial(_camera_ends, disappears=True),
     "SIGTERM while the camera sends nothing more": partial(_camera_ends, disappears=False),
-    "a file of the same name is created": _created_during_the_session,
     "the reader of raw frames ends": partial(_pipe, reader_ends=True),
     "SIGTERM while the reader of raw frames is blocked": partial(_pipe, reader_ends=False),
 }

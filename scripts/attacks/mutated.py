@@ -4,8 +4,7 @@ import contextlib
 import io
 import random
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,6 @@ from attacks.files import (
     BANDS,
     DETECTION,
     FULL_SCALE,
-    TIMING,
     vibrating_counts,
     write_hdf5,
     write_raw,
@@ -28,6 +26,7 @@ from attacks.files import (
 from attacks.trial import Trial
 from attacks.warm import in_warm_child
 from gpmf_file import mp4, packets_of
+from small_stack import CAMERA, TIMING
 
 import rsvib_torch as rsv
 from rsvib_torch.commands.main import run_command
@@ -36,25 +35,11 @@ from rsvib_torch.io import open_stack
 from rsvib_torch.report.results import read_vibration
 
 SECONDS, MEMORY = 10.0, 1 << 30  # limits of one trial
-CONFIG = """
-[sensor]
-row_time = 1e-4
-exposure_rows = 6
-frame_rows = 104
-full_scale = 4095
-frame_start_times = [0.0, 0.0104, 0.0208]
-
-[detection]
-method = "bands"
-tones = 1
-band_rows = 16
-band_step = 8
-search = 6
-
-[restoration]
-method = "banded"
-half_rows = 8
-
+_RUN_EVERY = 12  # the program is run in one of so many trials, on a stack
+_TIMES = "frame_start_times = [0.0, 0.0104, 0.0208]\n"
+CONFIG = (
+    CAMERA.replace("[detection]", _TIMES + "[detection]")
+    + """
 [simulation]
 num_frames = 3
 seed = 1
@@ -70,16 +55,8 @@ read_noise = 0.003
 window = 4
 bad_frames = "skip"
 """
+)
 _TOKENS = (*b'-1 0 99999999999999999999 1e999 nan null [] {} "" true \xff'.split(), b"[" * 60)
-
-
-@dataclass(frozen=True)
-class Original:
-    """A file to damage."""
-
-    target: str  # what is read, the file or the folder it belongs to
-    read: Callable[[Path], Any]  # how it is read
-    text: bool = False  # whether it is text
 
 
 def _read_stack(path: Path, most: int = 50) -> None:
@@ -101,22 +78,22 @@ def _read_manifest(path: Path) -> None:
 
 _STACKS = ("pages.tif", "packed.tif", "tiles.tif", "own.tif", "frames.npy", "frames.png", "colour.png", "frames.jpg")
 _STACKS += ("plain.h5", "packed.h5", "frames.raw", "frames.mkv", "frames.mp4")
-# Files to damage, by the name of the file.
-ORIGINALS = {name: Original(name, _read_stack) for name in _STACKS} | {
-    "pngs/frame_0001.png": Original("pngs", _read_stack),
-    "frames.raw.json": Original("frames.raw", _read_stack, text=True),
-    "frames.zarr/zarr.json": Original("frames.zarr", _read_stack, text=True),
-    "frames.zarr/c/1/0/0": Original("frames.zarr", _read_stack),
-    "camera.toml": Original("camera.toml", read_config, text=True),
-    "motion.csv": Original("motion.csv", lambda path: str(rsv.read_motion(path, unit="px")), text=True),
-    "clip.gcsv": Original("clip.gcsv", lambda path: str(rsv.read_gyroscope(path)), text=True),
-    "rates.csv": Original("rates.csv", lambda path: str(rsv.read_gyroscope(path, unit="rad/s")), text=True),
-    "clip.mp4": Original("clip.mp4", lambda path: str(rsv.read_gyroscope(path))),
-    "out.npy.manifest.json": Original("out.npy.manifest.json", _read_manifest, text=True),
-    "vibration.json": Original("vibration.json", lambda path: str(read_vibration(path, TIMING)), text=True),
-    "detection.json": Original("detection.json", lambda path: str(rsv.DetectionResult.load(path)), text=True),
-    "free.json": Original("free.json", lambda path: str(rsv.FreeMotion.load(path)), text=True),
-    "swept.json": Original("swept.json", lambda path: str(rsv.SweptTone.load(path)), text=True),
+_TEXTS = (".json", ".toml", ".csv", ".gcsv")  # endings of files of text
+# Files to damage, or members of what is read, and how it is read.
+ORIGINALS: dict[str, Callable[[Path], Any]] = {
+    **dict.fromkeys(_STACKS, _read_stack),
+    **dict.fromkeys(("pngs/frame_0001.png", "frames.zarr/zarr.json", "frames.zarr/c/1/0/0"), _read_stack),
+    "frames.raw.json": lambda path: _read_stack(path.with_suffix("")),
+    "camera.toml": read_config,
+    "motion.csv": lambda path: str(rsv.read_motion(path, unit="px")),
+    "clip.gcsv": lambda path: str(rsv.read_gyroscope(path)),
+    "rates.csv": lambda path: str(rsv.read_gyroscope(path, unit="rad/s")),
+    "clip.mp4": lambda path: str(rsv.read_gyroscope(path)),
+    "out.npy.manifest.json": _read_manifest,
+    "vibration.json": lambda path: str(read_vibration(path, TIMING)),
+    "detection.json": lambda path: str(rsv.DetectionResult.load(path)),
+    "free.json": lambda path: str(rsv.FreeMotion.load(path)),
+    "swept.json": lambda path: str(rsv.SweptTone.load(path)),
 }
 
 
@@ -194,7 +171,7 @@ def damage(content: bytes, seed: int, text: bool) -> bytes:
 
 def _run(folder: Path, target: Path) -> str:
     """Run the program on a damaged stack; returns why that is a failure, an empty text if it is not."""
-    (folder / "good.toml").write_text(CONFIG.replace("frame_start_times = [0.0, 0.0104, 0.0208]", ""))
+    (folder / "good.toml").write_text(CONFIG.replace(_TIMES, ""))
     out = folder / "results"
     errors = io.StringIO()
     with contextlib.redirect_stderr(errors), contextlib.redirect_stdout(io.StringIO()):
@@ -217,12 +194,12 @@ def attempt(folder: Path, item: Item) -> str:
     """Read one damaged file, or run the program on it."""
     contents = write_originals(folder)
     seed, name, runs = item
-    original, path = ORIGINALS[name], folder / name
-    path.write_bytes(damage(contents[name], seed, original.text))
+    path, target = folder / name, folder / name.partition("/")[0]
+    path.write_bytes(damage(contents[name], seed, path.suffix in _TEXTS))
     try:
         if runs:
-            return _run(folder, folder / original.target)
-        original.read(folder / original.target)
+            return _run(folder, target)
+        ORIGINALS[name](target)
         return ""
     except (ValueError, TypeError, OSError) as error:
         lines = str(error).splitlines()  # a configuration has one line per mistake
@@ -234,15 +211,14 @@ def attempt(folder: Path, item: Item) -> str:
         path.write_bytes(contents[name])
 
 
-def trials(
-    folder: Path, count: int, seed: int, run_every: int = 12, names: Sequence[str] = tuple(ORIGINALS)
-) -> Iterator[Trial]:
+def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
     """Damaged files in turn; the program is run on every twelfth stack, the other files are read."""
-    stacks = [name for name, original in ORIGINALS.items() if original.read is _read_stack]
+    stacks = [name for name, read in ORIGINALS.items() if read is _read_stack]
     items: list[tuple[str, Item]] = []
+    names = list(ORIGINALS)
     for index in range(count):
-        runs = bool(run_every) and index % run_every == 0
-        chosen = stacks[index // run_every % len(stacks)] if runs else names[index % len(names)]
+        runs = index % _RUN_EVERY == 0
+        chosen = stacks[index // _RUN_EVERY % len(stacks)] if runs else names[index % len(names)]
         number = 1_000_003 * seed + index
         items.append((f"{chosen}, seed {number}{', rsvib run' * runs}", (number, chosen, runs)))
     place = folder / "files"

@@ -230,10 +230,9 @@ def calls_of(reference: Reference, kind: str) -> int:
 
 
 def finished_windows(folder: Path, name: str) -> int:
-    """Number of windows of an interrupted run that have a complete line in the journal."""
-    journal = folder / f".{name}.rsvib" / "journal"
-    lines = journal.read_bytes().partition(b"\0")[0].count(b"\n") if journal.exists() else 0
-    return max(0, lines - 1)
+    """Number of windows of an interrupted run that have a complete record."""
+    records = (folder / f".{name}.rsvib").glob("0*.json")
+    return sum(path.read_bytes().endswith(b"}") and b"\0" not in path.read_bytes() for path in records)
 
 
 def kill_run(reference: Reference, folder: Path, kind: str, choice: random.Random, *, windows: int) -> None:
@@ -246,20 +245,6 @@ def kill_run(reference: Reference, folder: Path, kind: str, choice: random.Rando
         fork(counted_run, reference.source, folder / name, options, die_at)
         if finished_windows(folder, name) >= windows:
             return
-
-
-def resumed_trial(reference: Reference, folder: Path, kind: str, title: str, finished: int = 0) -> Trial:
-    """Resume a run, which must use the finished windows and give the result of an uninterrupted run."""
-    name, options = FORMATS[kind]
-    code, result = fork(resume, reference.source, folder / name, options)
-    if code != 0:
-        return Trial(title, "hang" if code is None else "traceback" if code == 1 else "lost", str(result))
-    difference = reference.difference(folder, name)
-    if difference:
-        return Trial(title, "wrong", difference)
-    if result < finished:
-        return Trial(title, "lost", f"{finished} windows were complete, {result} were resumed")
-    return Trial(title, "completed")
 
 
 def completed_or_refused(title: str, code: int | None, result: Any, difference: str) -> Trial:

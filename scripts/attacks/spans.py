@@ -7,9 +7,10 @@ from itertools import accumulate
 from pathlib import Path
 
 import torch
-from attacks.files import BANDS, DETECTION, FULL_SCALE, TIMING, vibrating_counts
+from attacks.files import BANDS, DETECTION, FULL_SCALE, vibrating_counts
 from attacks.trial import Trial
 from attacks.warm import in_warm_child
+from small_stack import TIMING
 
 import rsvib_torch as rsv
 

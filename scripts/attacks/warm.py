@@ -1,11 +1,11 @@
 """Trials in a warm child process, which has imported the package: one trial takes milliseconds instead of seconds."""
 
 import contextlib
+import math
 import multiprocessing
 import os
 import resource
 import signal
-import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterable, Iterator
@@ -13,7 +13,6 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-import psutil
 import torch
 from attacks.trial import Trial
 
@@ -45,7 +44,12 @@ def _tried(attempt: Attempt, folder: Path, name: str, item: Any) -> Trial:
 
 
 def _serve(
-    connection: Connection, attempt: Attempt, prepare: Callable[[Path], Any] | None, folder: Path, memory: int
+    connection: Connection,
+    attempt: Attempt,
+    prepare: Callable[[Path], Any] | None,
+    folder: Path,
+    limit: float,
+    memory: int,
 ) -> None:
     """Run trials until the other end closes the connection; output of libraries is discarded."""
     torch.set_num_threads(1)
@@ -62,23 +66,10 @@ def _serve(
     connection.send(None)
     with contextlib.suppress(EOFError):
         while True:
-            connection.send(_tried(attempt, folder, *connection.recv()))
-
-
-def _answers(connection: Connection, child: Any, limit: float) -> bool:
-    """Whether the child answers within the time limit, or ends."""
-
-    def used() -> float:
-        with contextlib.suppress(psutil.NoSuchProcess):
-            times = psutil.Process(child.pid).cpu_times()
-            return times.user + times.system
-        return 0.0
-
-    before, begin = used(), time.perf_counter()
-    while not connection.poll(0.5):
-        if used() - before > limit or time.perf_counter() - begin > 10 * limit:
-            return False
-    return True
+            name, item = connection.recv()
+            end = math.ceil(sum(os.times()[:2]) + limit)  # s of processor time; then SIGXCPU ends the process
+            resource.setrlimit(resource.RLIMIT_CPU, (end, resource.RLIM_INFINITY))
+            connection.send(_tried(attempt, folder, name, item))
 
 
 def in_warm_child(
@@ -102,31 +93,31 @@ def in_warm_child(
         prepare: Makes what all trials share, in every new child.
     """
     context = multiprocessing.get_context("spawn")
-    child, connection = None, None
+    child = None
     try:
         for name, item in items:
             if child is None:
                 connection, other = context.Pipe()
-                child = context.Process(target=_serve, args=(other, attempt, prepare, folder, memory), daemon=True)
+                arguments = (other, attempt, prepare, folder, limit, memory)
+                child = context.Process(target=_serve, args=arguments, daemon=True)
                 child.start()
                 other.close()
                 connection.recv()
-            assert connection is not None
             connection.send((name, item))
-            if _answers(connection, child, limit):
-                try:
+            hangs = not connection.poll(10 * limit)
+            try:
+                if not hangs:
                     yield connection.recv()
                     continue
-                except EOFError:
-                    child.join()
-                    trial = Trial(name, "traceback", f"the process ended with exit code {child.exitcode}")
+            except EOFError:
+                child.join()
+                hangs = child.exitcode == -signal.SIGXCPU
+            if hangs:
+                yield Trial(name, "hang", f"not finished after {limit:g} s of processor time")
             else:
-                trial = Trial(name, "hang", f"not finished after {limit:g} s of processor time")
+                yield Trial(name, "traceback", f"the process ended with exit code {child.exitcode}")
             child.kill()
-            child.join()
             child = None
-            yield trial
     finally:
         if child is not None:
             child.kill()
-            child.join()

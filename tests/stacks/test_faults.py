@@ -54,23 +54,17 @@ def test_an_interrupted_run_is_not_overwritten_or_resumed_with_other_settings(in
     assert not (interrupted / "out.tif").exists()
 
 
-def test_an_edited_journal_is_refused(interrupted):
-    journal = work_folder(interrupted / "out.tif") / "journal"
-    lines = journal.read_bytes().splitlines(keepends=True)
-    edited = b"".join([*lines[:-1], lines[-1].replace(b'"restored"', b'"as taken"')])
-    journal.write_bytes(edited)
-    with pytest.raises(ValueError, match="journal is damaged; delete"):
-        process_small(interrupted / "frames.tif", interrupted / "out.tif", resume=True)
-    assert journal.read_bytes() == edited
-
-
-@pytest.mark.parametrize("written", [None, -9, 0])
-def test_all_windows_before_an_incomplete_line_of_the_journal_are_kept(interrupted, whole, written):
-    journal = work_folder(interrupted / "out.tif") / "journal"
-    *lines, last = journal.read_bytes().splitlines(keepends=True)  # the first one is the header
-    complete = len(lines)
-    if written is not None:
-        journal.write_bytes(b"".join([*lines, last[:written], bytes(100)]))
+@pytest.mark.parametrize("change", [b"", b"{", bytes(100), "edited", "of another window", "of other settings"])
+def test_a_window_whose_record_is_not_as_it_was_written_is_computed_again(interrupted, whole, change):
+    folder = work_folder(interrupted / "out.tif")
+    records = sorted(folder.glob("0*.json"))
+    complete, content = len(records), records[1].read_bytes()
+    if change == "of other settings":  # an edited file of settings changes nothing, the records have their hash
+        settings = folder / "settings.json"
+        settings.write_bytes(settings.read_bytes().replace(b'"window": 3', b'"window": 4'))
+    else:
+        edited = {"edited": content.replace(b'"restored"', b'"as taken"'), "of another window": records[0].read_bytes()}
+        records[1].write_bytes(edited.get(change, change))
         complete -= 1
     report = process_small(interrupted / "frames.tif", interrupted / "out.tif", resume=True)
     assert 2 < report.resumed == complete < WINDOWS

@@ -1,10 +1,11 @@
-"""The machine loses power: everything that was not synchronised is discarded, then the run is resumed.
+"""Runs are killed, or the machine loses power, and they are resumed: the result must be that of an uninterrupted run.
 
-The calls ``fsync`` and ``fdatasync`` of a run are recorded: the content of a file when it was synchronised last, and
-the names in a folder when it was. At a random call the run ends. In every other round its folder is replaced by what
-was recorded: files that were never synchronised are empty, names that were not are missing. In the others a random
-part of the later changes is kept as well, because a file system may write any of them at any time: new names, removed
-names, and parts of the content.
+A run is killed at a random call that changes a file, or after a random time. In two of three rounds the machine loses
+power as well. The calls ``fsync`` and ``fdatasync`` of a run are recorded: the content of a file when it was
+synchronised last, and the names in a folder when it was. The folder is then replaced by what was recorded: files that
+were never synchronised are empty, names that were not are missing. In every other of these rounds a random part of the
+later changes is kept as well, because a file system may write any of them at any time: new names, removed names, and
+parts of the content.
 """
 
 import json
@@ -17,17 +18,25 @@ from typing import Any
 
 from attacks.small_runs import (
     FORMATS,
+    FRAMES,
+    LIMIT,
     WINDOWS,
+    Child,
     Reference,
     calls_of,
+    completed_or_refused,
+    content,
     count_file_calls,
-    finished_windows,
     fork,
     in_turn,
     process,
-    resumed_trial,
+    resume,
 )
 from attacks.trial import Trial
+
+_LONGEST = 0.6  # s; a run takes 0.2 to 0.5 s on an idle core
+_KEPT = ("all", "no", "some")  # later changes
+_FRAMES = "frames"  # name of the file with the number of frames that a run has reported as complete
 
 
 def _recorded_run(source: Path, sink: Path, options: dict[str, Any], root: Path, records: Path, die_at: int) -> int:
@@ -55,7 +64,7 @@ def _recorded_run(source: Path, sink: Path, options: dict[str, Any], root: Path,
     names = {entry.name: (entry.inode(), entry.is_dir()) for entry in os.scandir(root)}
     (records / f"{root.stat().st_ino}.names").write_text(json.dumps(names))
     done = count_file_calls(die_at, record)
-    process(source, sink, **options)
+    process(source, sink, **options, progress=lambda frames, _: (records / _FRAMES).write_text(str(frames)))
     return done[0]
 
 
@@ -115,19 +124,37 @@ class _PowerLoss:
 
 
 def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
-    """The formats take turns."""
+    """The formats take turns; every other run that keeps all changes is killed twice."""
     reference, choice = Reference(folder / "reference"), random.Random(seed)
     for number, kind, place in in_turn(folder, count):
         name, options = FORMATS[kind]
         root, records, after = place / "disk", place / "records", place / "after"
         for path in (root, records):
             path.mkdir()
-        call, mixed = choice.randint(1, calls_of(reference, kind)), bool(number // len(FORMATS) % 2)
-        title = f"{kind}, call {call}, {'some' if mixed else 'no'} later changes"
-        code, result = fork(_recorded_run, reference.source, root / "new" / name, options, root, records, call)
-        if code in (1, 2, None):
+        kept, code, ends = _KEPT[number // len(FORMATS) % len(_KEPT)], None, []
+        for _ in range(1 + (kept == "all" and number % 2)):
+            by_time = choice.random() < 0.5
+            call, moment = choice.randint(1, calls_of(reference, kind)), choice.uniform(0.0, _LONGEST)
+            ends.append(f"after {moment:.4f} s" if by_time else f"at call {call}")
+            arguments = (root, records, 0 if by_time else call)
+            run = Child(_recorded_run, reference.source, root / "new" / name, {**options, "resume": True}, *arguments)
+            code, result = run.ended(moment if by_time else LIMIT)
+        title, left = f"{kind}, {' and '.join(ends)}, {kept} later changes", root
+        if code in (1, 2):
             yield Trial(title, "traceback", str(result))
-        else:
-            _PowerLoss(root, records, choice if mixed else None).build(root.stat().st_ino, root, after)
-            finished = min(finished_windows(after / "new", name), WINDOWS)
-            yield resumed_trial(reference, after / "new", kind, title, finished)
+            continue
+        if kept != "all":
+            _PowerLoss(root, records, choice if kept == "some" else None).build(root.stat().st_ino, root, after)
+            left = after
+        sink = left / "new" / name
+        if kind != "PNG folder" and sink.exists() and content(sink) != content(reference.whole / name):
+            yield Trial(title, "wrong", "an incomplete output has its name")
+            continue
+        frames = (records / _FRAMES).read_text() if (records / _FRAMES).exists() else ""
+        finished = int(frames or 0) // ((FRAMES - 1) // WINDOWS)  # the last window has one more frame
+        code, result = fork(resume, reference.source, sink, options)
+        difference = reference.difference(sink.parent, name) if code == 0 else ""
+        trial = completed_or_refused(title, code, result, difference)
+        if trial.outcome == "refused" or (trial.outcome == "completed" and result < finished):
+            trial = Trial(title, "lost", f"{finished} windows were complete, resumed: {result}")
+        yield trial
