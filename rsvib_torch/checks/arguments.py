@@ -21,8 +21,8 @@ from pydantic import ConfigDict, Field, GetPydanticSchema, Strict, TypeAdapter
 from pydantic_core import core_schema
 from torch import Tensor
 
-from rsvib_torch.checks.validation import Number, members_of, validated, without_alias
-from rsvib_torch.checks.values import MAX_NUMBER, described
+from rsvib_torch.checks.validation import Number
+from rsvib_torch.checks.values import MAX_NUMBER, described, members_of, validated, without_alias
 from rsvib_torch.text import one_line, quoted
 
 P = ParamSpec("P")
@@ -220,7 +220,7 @@ def _checked(name: str, value: object, kind: object, *, finite: bool = True) -> 
         return check_tensor(name, value)
     if isinstance(value, _ARRAYS) and any({int, float} & {*get_args(member)} for member in members):
         value = (check_tensor(name, value) if isinstance(value, Tensor) else value).tolist()
-    return validated(name, tuple(value) if isinstance(value, (torch.Size, range)) else value, adapter, kind)
+    return validated(name, tuple(value) if isinstance(value, (torch.Size, range)) else value, adapter)
 
 
 @cache
@@ -245,7 +245,8 @@ def _bounded(kind: Any, finite: bool) -> Any:  # noqa: PLR0911
     if get_origin(kind) in (os.PathLike, np.ndarray) or (
         isinstance(kind, type) and kind not in _PLAIN and get_origin(kind) is None
     ):
-        of_class = core_schema.is_instance_schema(get_origin(kind) or kind)  # pydantic checks only the class
+        made_by = f"{kind.__name__} ({kind._MADE_BY})" if hasattr(kind, "_MADE_BY") else None
+        of_class = core_schema.is_instance_schema(get_origin(kind) or kind, cls_repr=made_by)
         return Annotated[Any, GetPydanticSchema(lambda source, handler: of_class)]
     arguments: Any = tuple(argument if argument is ... else _bounded(argument, finite) for argument in get_args(kind))
     if get_origin(kind) is tuple:

@@ -10,7 +10,8 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 import typer
 from pydantic import Field
 
-from rsvib_torch.checks.validation import fields_of, members_of, options
+from rsvib_torch.checks.validation import fields_of, options
+from rsvib_torch.checks.values import members_of
 from rsvib_torch.commands.terminal import Answer, current_output, error_line, show_answer
 from rsvib_torch.files.reading import Table
 from rsvib_torch.options import COMMAND_LINE

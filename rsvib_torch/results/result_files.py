@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import check_fields, hints_of
-from rsvib_torch.checks.validation import members_of
+from rsvib_torch.checks.values import members_of
 from rsvib_torch.files.atomic import whole_file
 from rsvib_torch.files.reading import Table
 from rsvib_torch.results.reason import read_findings

@@ -173,7 +173,7 @@ def test_options_of_restoration_come_from_config_or_command_line(place, tmp_path
     at_rest = read_stack(place / "scene.png")[0, 32:-32, 32:-32]
     assert decibel(read_stack(out / "restored.tif")[0], at_rest.numpy()) > 40
     for options, message in (
-        (("--method", "dewarp", "--joint", "2"), "method='dewarp' has no option 'joint'; its options are chunk_rows"),
+        (("--method", "dewarp", "--joint", "2"), "--joint is no option of method='dewarp'; its options are chunk_rows"),
         (("--method", "exact", "--joint", "many"), "--joint must be 'all' or a number of frames, got 'many'"),
     ):
         assert message in refused(capsys, *common, *options)
@@ -241,7 +241,7 @@ def bad_inputs(place):
         ("run", "cut.tif", "camera.toml", "cut.tif: not a readable TIFF stack: "),
         ("run", "none.tif", "camera.toml", "none.tif does not exist"),
         ("detect", "frames.tif", "none.toml", "none.toml: No such file or directory"),
-        ("detect", "frames.tif", "wrong.toml", "detection.search: expected at least 2, got 1"),
+        ("detect", "frames.tif", "wrong.toml", "detection.search must be at least 2, got 1"),
     ],
 )
 def test_errors_of_bad_input_are_one_line_and_leave_no_files(
