@@ -101,10 +101,18 @@ VIBRATION = "[simulation.vibration]\namplitude = [1, 2]\nfrequency = [40, 30]\n"
         (SENSOR + "[restoration]\nmethod = 'magic'", "restoration.method must be '"),
         (
             SENSOR + "[restoration]\nmethod = 'banded'\nhalf_row = 1",
-            "unknown option 'restoration.half_row'; the options are",
+            "unknown option 'restoration.half_row'; ",
         ),
         (SENSOR + "[simulation]\nseed = 1", "simulation.vibration is missing; expected a table with amplitude, freq"),
         (SENSOR + VIBRATION.replace("[1, 2]", "[-1, 2]"), "simulation.vibration: amplitude must not be negative, got"),
+        (
+            SENSOR + VIBRATION + "camera = {focal_length = 0}",
+            "simulation.vibration.camera.focal_length must be at least 1",
+        ),
+        (
+            SENSOR + VIBRATION + "camera = {focal_length = 9, distortion = [1, 2, 3, 4]}",
+            "simulation.vibration.camera: distortion must be 5 numbers",
+        ),
         (SENSOR + VIBRATION + "[simulation.noise]\nfull_well = 0", "simulation.noise.full_well must be larger than"),
         (SENSOR + "[stack]\nwindow = 1", "stack.window must be at least 2, got 1"),
         ("[sensor", "not a TOML file: Expected ']'"),

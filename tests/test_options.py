@@ -48,7 +48,7 @@ def test_values_are_kept_or_refused_but_not_converted():
         (
             {"method": "dewarp", "half_rows": 2},
             ValueError,
-            "half_rows is no option of method='dewarp'; its options are",
+            "half_rows is no option of method='dewarp'; its",
         ),
         ({"noise": -1.0}, ValueError, r"noise must be at least 0, got -1.0 \(float\)"),
         ({"method": "richardson-lucy", "iterations": 10**9}, ValueError, "iterations must be at most 1000, got"),

@@ -327,6 +327,9 @@ def full_scale_of(path: Path, info: "StackInfo", config: Config, option: float |
     """Full scale of a stack: from the option, else from the file (or its 8-bit type), else from the configuration."""
     if option is not None or not info.is_integer:
         return option
+    if info.full_scale is None and config.full_scale is None:
+        unknown = f"{path}: the full scale of its {info.dtype} counts is not known"
+        raise ValueError(f"{unknown}: give --full-scale, e.g. 4095 for 12 bits, or full_scale in [sensor]")
     if info.full_scale is None:
         return config.full_scale
     if info.dtype != "uint8" and config.full_scale not in (None, info.full_scale):

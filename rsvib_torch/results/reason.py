@@ -338,6 +338,7 @@ _SHAPES = {
     ),
     "motion_uncertain": _px(
         "the motion is determined to {value:.3g} px only, {limit:g} px are needed: frames may show different scenes",
+        "use detect_vibration with image_acceleration=True if the motion has a constant acceleration",
         compares="rms standard deviation of the visible part of the motion, above 0.3 px",
     ),
     "common_motion_uncertain": _px(

@@ -187,8 +187,10 @@ def test_full_scale_comes_from_option_file_or_config(place, tmp_path, capsys):
     silent = tmp_path / "silent.toml"
     silent.write_text(CONFIG.replace("full_scale = 4095", ""))
     assert rsvib("detect", arguments[0], "--config", silent, "--out", tmp_path / "o", "--full-scale", 4095) == 0
-    unknown = refused(capsys, "detect", arguments[0], "--config", silent, "--out", tmp_path / "out2")
-    assert "full scale of uint16 frames unknown: pass full_scale, e.g. full_scale=4095" in unknown
+    found = ("--vibration", tmp_path / "out" / "vibration.json")
+    for command in (("detect", "--out", tmp_path / "out2"), ("restore", tmp_path / "r.tif", *found)):
+        unknown = refused(capsys, command[0], arguments[0], *command[1:], "--config", silent)
+        assert "plain.tif: the full scale of its uint16 counts is not known: give --full-scale, e.g. 4095" in unknown
     other = tmp_path / "other.toml"
     other.write_text(CONFIG.replace("4095", "16383"))
     two = refused(capsys, "detect", place / "frames.tif", "--config", other, "--out", tmp_path / "out2")
