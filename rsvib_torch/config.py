@@ -111,7 +111,7 @@ def presets() -> dict[str, str]:
     }
 
 
-def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, Any] | None = None) -> Config:
+def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, object] | None = None) -> Config:
     """Read a configuration file.
 
     Only ``[sensor]`` is required.

@@ -5,7 +5,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 import typer
 from pydantic import Field
@@ -16,6 +16,7 @@ from rsvib_torch.commands.terminal import Answer, current_output, error_line, sh
 from rsvib_torch.files.reading import Table
 from rsvib_torch.options import COMMAND_LINE
 
+Group = TypeVar("Group")
 _NOT_RELIABLE = 3  # exit code
 
 
@@ -117,12 +118,12 @@ def _naming_options(parameters: Sequence[inspect.Parameter]) -> Iterator[None]:
         raise
 
 
-def flat_command(name: str, command: Callable[[Any], Answer]) -> Callable[..., None]:
+def flat_command(name: str, command: Callable[[Group], Answer]) -> Callable[..., None]:
     """A command as typer calls it: its options are flat, and its answer is printed."""
     (group,) = (parameter.annotation for parameter in inspect.signature(command, eval_str=True).parameters.values())
     fields = list(_parameters(group))
 
-    def flat(**given: Any) -> None:
+    def flat(**given: object) -> None:
         values: Table = {}
         for place, parameter in fields:
             value = given[parameter.name]
@@ -132,7 +133,7 @@ def flat_command(name: str, command: Callable[[Any], Answer]) -> Callable[..., N
                 is_given = value is not None and (value is not False or parameter.default is None)
                 values.setdefault(place, {}).update({parameter.name: value} if is_given else {})
         output = current_output()
-        output.as_json, output.quiet = given["as_json"], given["quiet"]
+        output.as_json, output.quiet = bool(given["as_json"]), bool(given["quiet"])
         with _naming_options([parameter for _, parameter in fields if given[parameter.name] is not None]):
             answer = command(group(**values))
         show_answer(name, answer)

@@ -45,7 +45,7 @@ class OffsetCurve(
     shapes={
         "pairs": "P 2",
         "rows": "N",
-        "offsets": "... P N A=2-4",
+        "offsets": "... P N A",
         "times": "[...] P N",
         "later_times": "[...] P N",
         "quality": "... P N",

@@ -118,6 +118,7 @@ _OPTIONS = {
     "pass row_time=(low, high)": "give --row-time twice",
     "scan_axis=": "--scan-axis ",
     "readout_direction=": "--readout-direction ",
+    "detect_vibration with image_acceleration=True": "rsvib detect with image_acceleration = true in [detection]",
     "roll=True, zoom=True and no columns": "no columns, and true for roll and zoom, in [detection]",
 }
 _of_program: list[bool] = []  # not empty while a command runs
