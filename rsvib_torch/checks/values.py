@@ -45,15 +45,11 @@ def described(value: object) -> str:
     return type(value).__name__
 
 
-def named(error: Error, argument: str, problem: str) -> Error:
-    """The error with the argument that it is about and what is wrong with it, as commands state it for an option."""
-    vars(error).update(argument=argument, problem=problem)
-    return error
-
-
 def refused(kind: type[Error], name: str, problem: str) -> Error:
-    """The error of an argument: its name and what is wrong with it, also as data."""
-    return named(kind(f"{name} {problem}"), name, problem)
+    """The error of an argument: its name, also as data for the option of a command, and what is wrong with it."""
+    error = kind(f"{name} {problem}")
+    vars(error).update(argument=name)
+    return error
 
 
 def check_single(name: str, value: Any) -> None:
@@ -136,9 +132,9 @@ def _explained(path: str, keys: Sequence[str | int], entries: list[ErrorDetails]
         return TypeError(f"unknown option {quoted(place)}; the options are {', '.join(_options_at(group, keys[:-1]))}")
     if kind == "value_error":  # of a validator, which may state its argument
         cause = context["error"]
-        argument, problem = getattr(cause, "argument", ""), getattr(cause, "problem", str(cause))
-        inner = ".".join(filter(None, (place, argument)))
-        return named(ValueError(f"{inner} {problem}" if argument else f"{place}: {cause}".lstrip(": ")), inner, problem)
+        if argument := getattr(cause, "argument", ""):
+            return refused(ValueError, f"{place}.{argument}".strip("."), str(cause).removeprefix(argument).strip())
+        return ValueError(f"{place}: {cause}" if place else str(cause))
     texts = (_BOUNDS[kind].format(**context),) if kind in _BOUNDS else (one["msg"] for one in entries)
     expected = " or ".join(dict.fromkeys(text.removeprefix("Input should be ") for text in texts))
     expected = expected.replace("a valid integer", "a whole number").replace("a valid ", "a ")

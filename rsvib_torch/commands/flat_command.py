@@ -109,12 +109,13 @@ def _naming_options(parameters: Sequence[inspect.Parameter]) -> Iterator[None]:
         yield
     except (TypeError, ValueError) as error:
         # options replace the keys of [sensor], in a file as well
-        name = re.split(r"[.[]", getattr(error, "argument", "").removeprefix("sensor."))[0]
+        argument = getattr(error, "argument", "")
+        name = re.split(r"[.[]", argument.removeprefix("sensor."))[0]
         for parameter in parameters:
             info = get_args(parameter.annotation)[1]
             if parameter.name == name and isinstance(info, typer.models.OptionInfo):
                 option = info.default if isinstance(info.default, str) else f"--{name.replace('_', '-')}"
-                raise ValueError(f"{option} {vars(error)['problem']}") from error
+                raise ValueError(option + str(error).splitlines()[0].partition(argument)[2]) from error
         raise
 
 
