@@ -69,7 +69,7 @@ def check_shapes(values: Mapping[str, Any], shapes: Mapping[str, str]) -> None:
     the components of a motion; ``...`` for leading dimensions that are the same in all tensors, or ``[...]`` for these
     or none. ``...`` alone, for values that are not tensors, is not checked; None is omitted.
     """
-    known: dict[str, object] = {}
+    known: dict[str, Any] = {}
 
     def fits(axis: str, size: int) -> bool:
         if axis.isdecimal():

@@ -62,12 +62,14 @@ def check_number(
     name: str, value: object, *, above: float | None = None, at_least: float | None = None, at_most: float | None = None
 ) -> float:
     """Return ``value`` as a finite float within its bounds; booleans are refused."""
-    return validated(name, value, _adapter(float, gt=above, ge=at_least, le=at_most))
+    number: float = validated(name, value, _adapter(float, gt=above, ge=at_least, le=at_most))
+    return number
 
 
 def check_whole_number(name: str, value: object, *, at_least: int, at_most: int = 2**63 - 1) -> int:
     """Return ``value`` as an int from ``at_least`` to ``at_most``, by default the largest index of an array."""
-    return validated(name, value, _adapter(int, ge=at_least, le=at_most))
+    number: int = validated(name, value, _adapter(int, ge=at_least, le=at_most))
+    return number
 
 
 def check_choice(name: str, value: object, choices: tuple[object, ...]) -> None:
