@@ -9,12 +9,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from rsvib_torch import imaging, motion
-from rsvib_torch.checks.validation import Count, checked, options, validate
+from rsvib_torch.checks.validation import Count, options, validate
 from rsvib_torch.files.reading import Table, read_toml
 from rsvib_torch.motion.timing import SensorSection, SensorTiming
 from rsvib_torch.options import RestorationOptions, ToneOptions, WindowOptions
@@ -49,6 +49,12 @@ def simulation_section() -> Any:
         distortion: list[float] = Field(default_factory=lambda: [0.0] * 5, min_length=4, max_length=5)
         fisheye: bool = False
 
+        def __post_init__(self) -> None:
+            self.to_camera()  # which checks the values
+
+        def to_camera(self) -> motion.Camera:
+            return motion.Camera(**vars(self))
+
     @options
     class VibrationSection:
         """Fields of ``Vibration``, which checks their values; an axis is one number (one tone) or a list of tones."""
@@ -61,13 +67,14 @@ def simulation_section() -> Any:
         image_shift: list[float] = axes
         camera: CameraSection | None = None
 
-        @model_validator(mode="after")
-        def _check(self) -> Self:
-            checked(self.to_vibration)
-            return self
+        def __post_init__(self) -> None:
+            try:
+                self.to_vibration()
+            except TypeError as error:  # lists of different lengths; pydantic reports ``ValueError`` only
+                raise ValueError(str(error)) from error
 
         def to_vibration(self) -> motion.Vibration:
-            camera = None if self.camera is None else motion.Camera(**vars(self.camera))
+            camera = None if self.camera is None else self.camera.to_camera()
             return motion.Vibration(**{**vars(self), "camera": camera})
 
     @options
@@ -104,7 +111,7 @@ def presets() -> dict[str, str]:
     }
 
 
-def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, Any] | None = None) -> Config:
+def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, object] | None = None) -> Config:
     """Read a configuration file.
 
     Only ``[sensor]`` is required.

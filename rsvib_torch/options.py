@@ -22,9 +22,9 @@ from rsvib_torch.checks.validation import (
     Number,
     Positive,
     fields_of,
-    not_an_option,
     options,
 )
+from rsvib_torch.checks.values import refused
 
 if TYPE_CHECKING:
     from rsvib_torch.checks.arrays import ArrayLike
@@ -319,8 +319,9 @@ class RestorationOptions(ExactOptions, BandedOptions, DewarpOptions, RichardsonL
         for group in METHOD_OPTIONS.values():
             for name, field in fields_of(group).items():
                 if name not in names and getattr(self, name) != field.default:
-                    text = f"method={self.method!r} has no option {name!r}; its options are {', '.join(names)}"
-                    raise not_an_option(name, text)
+                    raise refused(
+                        ValueError, name, f"is no option of method={self.method!r}; its options are {', '.join(names)}"
+                    )
 
 
 @options

@@ -9,7 +9,7 @@ import argparse
 import inspect
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal, get_args, get_origin
 
 import griffe
 import harness
@@ -17,7 +17,8 @@ import typer
 from architecture import table_of_packages
 
 import rsvib_torch as rsv
-from rsvib_torch.checks.validation import expected_text, fields_of
+from rsvib_torch.checks.validation import fields_of
+from rsvib_torch.checks.values import members_of
 from rsvib_torch.commands.main import app
 from rsvib_torch.config import simulation_section
 from rsvib_torch.motion.timing import SensorSection
@@ -82,14 +83,29 @@ def value_text(value: object) -> str:
     return "`" + text.replace("'", '"') + "`"
 
 
+def type_text(annotation: object) -> str:
+    """A type in words."""
+    names = {float: "a number", int: "a whole number", str: "text", bool: "true or false"}
+    words = []
+    for member in members_of(annotation):
+        items = [members_of(item)[0] for item in get_args(member) if get_origin(member) in (list, tuple)]
+        kinds = [names.get(item, "a list").removeprefix("a ") + "s" for item in items]
+        if get_origin(member) is Literal:
+            words += [f'"{choice}"' if isinstance(choice, str) else str(choice) for choice in get_args(member)]
+        elif kinds:
+            words.append(f"a list of {kinds[0]}" if len(kinds) == 1 else f"{len(kinds)} {kinds[0]}")
+        else:
+            words.append(names.get(member) or f"a table with {', '.join(fields_of(member))}")
+    return " or ".join(words)
+
+
 def key_table(group: Any, keys: Iterable[str] = (), meaning: Mapping[str, str] | None = None) -> list[str]:
     """Table of the keys of a group of options or section, by default of all; ``meaning`` describes fields without."""
     rows = []
     for name in keys or fields_of(group):
         field = fields_of(group)[name]
         shown = "required" if field.is_required() else value_text(field.get_default(call_default_factory=True))
-        kind = expected_text(field.annotation).replace("'", '"')
-        rows.append([f"`{name}`", kind, shown, field.description or (meaning or {})[name]])
+        rows.append([f"`{name}`", type_text(field.annotation), shown, field.description or (meaning or {})[name]])
     return table(("key", "type", "default", "meaning"), rows)
 
 

@@ -151,7 +151,7 @@ def test_valid_shapes_are_accepted(shape, channels):
         ((48, 64, 1), None, r"or channels=\"first\" if these are 48 frames of 64 x 1 px"),
         ((2, 3, 48, 64), "last", r"appear to have their channels before the image axes: omit channels=\"last\""),
         ((8, 2, 48, 64), None, r"appear to be a batch \(B, T, H, W\): pass frames\[:, :, None\]"),
-        ((2, 48, 64, 3), "Last", "channels must be one of None, 'first', 'last'; got 'Last'"),
+        ((2, 48, 64, 3), "Last", "channels must be None, 'first' or 'last', got 'Last'"),
     ],
 )
 def test_shapes_that_are_refused(shape, channels, message):

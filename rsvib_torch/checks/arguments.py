@@ -6,7 +6,6 @@ are refused with the name of the argument. Bounds that depend on the function ar
 """
 
 import inspect
-import math
 import operator
 import os
 import types
@@ -21,8 +20,8 @@ from pydantic import ConfigDict, Field, GetPydanticSchema, Strict, TypeAdapter
 from pydantic_core import core_schema
 from torch import Tensor
 
-from rsvib_torch.checks.validation import Number, members_of, validated, without_alias
-from rsvib_torch.checks.values import MAX_NUMBER, described
+from rsvib_torch.checks.validation import Number
+from rsvib_torch.checks.values import MAX_NUMBER, described, members_of, validated, without_alias
 from rsvib_torch.text import one_line, quoted
 
 P = ParamSpec("P")
@@ -66,45 +65,35 @@ def as_numbers(name: str, value: object, device: torch.device | None = None) -> 
 def check_shapes(values: Mapping[str, Any], shapes: Mapping[str, str]) -> None:
     """Raise a ``ValueError`` unless tensors have the stated shapes.
 
-    Stated are the axes: a size; a name for a size of at least 1 that is the same in all tensors, with its limits if
-    there are any (``A=2-4``); ``...`` for leading dimensions that are the same in all tensors, or ``[...]`` for these
+    Stated are the axes: a size; a name for a size that is the same in all tensors, at least 1, and 2 to 4 for ``A``,
+    the components of a motion; ``...`` for leading dimensions that are the same in all tensors, or ``[...]`` for these
     or none. ``...`` alone, for values that are not tensors, is not checked; None is omitted.
     """
     known: dict[str, Any] = {}
+
+    def fits(axis: str, size: int) -> bool:
+        if axis.isdecimal():
+            return size == int(axis)
+        return size == known.get(axis, size) and (2 <= size <= 4 if axis == "A" else size >= 1)
+
     for name, stated in shapes.items():
         value = values.get(name)
         if value is None or stated == "...":
             continue
-        lead, axes = _stated_axes(stated)
+        lead, *axes = stated.split() if stated.startswith(("...", "[...]")) else ["", *stated.split()]
         shape = tuple(value.shape)
         count = len(shape) - len(axes)
         batch, sizes = shape[: max(count, 0)], shape[max(count, 0) :]
-        fits = count >= 0 and all(
-            low <= size <= high and size == known.get(axis, size)
-            for size, (axis, low, high) in zip(sizes, axes, strict=True)
-        )
         batches = {"": [()], "...": [known.get("...", batch)], "[...]": [known.get("...", batch), ()]}[lead]
-        if not fits or batch not in batches:
-            names = [lead.strip("[]")] * bool(lead) + [axis for axis, _, _ in axes]
-            limits = {axis: f"{low} to {high}" for axis, low, high in axes if low < high < math.inf} | known
+        if count < 0 or batch not in batches or not all(map(fits, axes, sizes)):
+            names = [lead.strip("[]")] * bool(lead) + axes
+            limits = {"A": "2 to 4"} | known
             where = ", ".join(f"{axis} = {limits[axis]}" for axis in names if axis in limits)
             expected = f"({', '.join(names)}{',' * (len(names) == 1)}){' with ' * bool(where)}{where}"
             raise ValueError(f"{name} must have shape {expected}, got {shape}")
-        known |= {axis: size for (axis, low, high), size in zip(axes, sizes, strict=True) if low < high}
+        known |= {axis: size for axis, size in zip(axes, sizes, strict=True) if not axis.isdecimal()}
         if batch or lead == "...":
             known["..."] = batch
-
-
-def _stated_axes(stated: str) -> tuple[str, list[tuple[str, int, float]]]:
-    """Mark of the leading dimensions, and name, smallest and largest size of each axis of a shape."""
-    names = stated.split()
-    lead = names.pop(0) if names[0] in ("...", "[...]") else ""
-    axes: list[tuple[str, int, float]] = []
-    for entry in names:
-        axis, _, limits = entry.partition("=")
-        low, _, high = (axis if axis.isdecimal() else limits or "1").partition("-")
-        axes.append((axis, int(low), int(high or low) if limits or axis.isdecimal() else math.inf))
-    return lead, axes
 
 
 def check_images(images: Mapping[str, Tensor], shapes: Mapping[str, str]) -> None:
@@ -220,7 +209,7 @@ def _checked(name: str, value: object, kind: object, *, finite: bool = True) -> 
         return check_tensor(name, value)
     if isinstance(value, _ARRAYS) and any({int, float} & {*get_args(member)} for member in members):
         value = (check_tensor(name, value) if isinstance(value, Tensor) else value).tolist()
-    return validated(name, tuple(value) if isinstance(value, (torch.Size, range)) else value, adapter, kind)
+    return validated(name, tuple(value) if isinstance(value, (torch.Size, range)) else value, adapter)
 
 
 @cache
@@ -245,7 +234,8 @@ def _bounded(kind: Any, finite: bool) -> Any:  # noqa: PLR0911
     if get_origin(kind) in (os.PathLike, np.ndarray) or (
         isinstance(kind, type) and kind not in _PLAIN and get_origin(kind) is None
     ):
-        of_class = core_schema.is_instance_schema(get_origin(kind) or kind)  # pydantic checks only the class
+        made_by = f"{kind.__name__} ({kind._MADE_BY})" if hasattr(kind, "_MADE_BY") else None
+        of_class = core_schema.is_instance_schema(get_origin(kind) or kind, cls_repr=made_by)
         return Annotated[Any, GetPydanticSchema(lambda source, handler: of_class)]
     arguments: Any = tuple(argument if argument is ... else _bounded(argument, finite) for argument in get_args(kind))
     if get_origin(kind) is tuple:

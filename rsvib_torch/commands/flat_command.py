@@ -5,16 +5,18 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 import typer
 from pydantic import Field
 
-from rsvib_torch.checks.validation import fields_of, members_of, options
+from rsvib_torch.checks.validation import fields_of, options
+from rsvib_torch.checks.values import members_of
 from rsvib_torch.commands.terminal import Answer, current_output, error_line, show_answer
 from rsvib_torch.files.reading import Table
 from rsvib_torch.options import COMMAND_LINE
 
+Group = TypeVar("Group")
 _NOT_RELIABLE = 3  # exit code
 
 
@@ -107,21 +109,22 @@ def _naming_options(parameters: Sequence[inspect.Parameter]) -> Iterator[None]:
         yield
     except (TypeError, ValueError) as error:
         # options replace the keys of [sensor], in a file as well
-        name = re.split(r"[.[]", getattr(error, "argument", "").removeprefix("sensor."))[0]
+        argument = getattr(error, "argument", "")
+        name = re.split(r"[.[]", argument.removeprefix("sensor."))[0]
         for parameter in parameters:
             info = get_args(parameter.annotation)[1]
             if parameter.name == name and isinstance(info, typer.models.OptionInfo):
                 option = info.default if isinstance(info.default, str) else f"--{name.replace('_', '-')}"
-                raise ValueError(f"{option} {vars(error)['problem']}") from error
+                raise ValueError(option + str(error).splitlines()[0].partition(argument)[2]) from error
         raise
 
 
-def flat_command(name: str, command: Callable[[Any], Answer]) -> Callable[..., None]:
+def flat_command(name: str, command: Callable[[Group], Answer]) -> Callable[..., None]:
     """A command as typer calls it: its options are flat, and its answer is printed."""
     (group,) = (parameter.annotation for parameter in inspect.signature(command, eval_str=True).parameters.values())
     fields = list(_parameters(group))
 
-    def flat(**given: Any) -> None:
+    def flat(**given: object) -> None:
         values: Table = {}
         for place, parameter in fields:
             value = given[parameter.name]
@@ -131,7 +134,7 @@ def flat_command(name: str, command: Callable[[Any], Answer]) -> Callable[..., N
                 is_given = value is not None and (value is not False or parameter.default is None)
                 values.setdefault(place, {}).update({parameter.name: value} if is_given else {})
         output = current_output()
-        output.as_json, output.quiet = given["as_json"], given["quiet"]
+        output.as_json, output.quiet = bool(given["as_json"]), bool(given["quiet"])
         with _naming_options([parameter for _, parameter in fields if given[parameter.name] is not None]):
             answer = command(group(**values))
         show_answer(name, answer)

@@ -198,6 +198,25 @@ class StackCommand(RangeOptions, CameraOptions, DeviceOptions):
         """The camera and the options of the configuration."""
         return self.settings_for(self.frames, self.frame_range)
 
+    @cached_property
+    def info(self) -> "StackInfo":
+        """What the file of the frames states."""
+        return io.read_stack_info(self.stack)
+
+    @cached_property
+    def scale(self) -> float | None:
+        """Full scale of integer frames: of the option, else of the file (or its 8-bit type) or the configuration."""
+        stated, configured = self.info.full_scale, self.settings.full_scale
+        if self.full_scale is not None or not self.info.is_integer:
+            return self.full_scale
+        if stated is None and configured is None:
+            unknown = f"{self.stack}: the full scale of its {self.info.dtype} counts is not known"
+            raise ValueError(f"{unknown}: give --full-scale, e.g. 4095 for 12 bits, or full_scale in [sensor]")
+        if stated is not None and self.info.dtype != "uint8" and configured not in (None, stated):
+            both = f"{stated:g} in the file and {configured:g} in the configuration"
+            raise ValueError(f"{self.stack}: the full scale is {both}; choose one with --full-scale")
+        return configured if stated is None else stated
+
     @property
     def inputs(self) -> list[Path]:
         """Files that are read."""
@@ -209,9 +228,8 @@ class StackCommand(RangeOptions, CameraOptions, DeviceOptions):
 
     def planned_restoration(self, given: Mapping[str, object]) -> "tuple[StackInfo, float | None, Table]":
         """What the file states, its full scale, and options of ``restore``: configured, replaced by those ``given``."""
-        info = io.read_stack_info(self.stack)
-        scale = full_scale_of(self.stack, info, self.settings, self.full_scale)
-        return info, scale, _restoration_options(info, scale, dict(self.settings.restoration), dict(given))
+        options = _restoration_options(self.info, self.scale, dict(self.settings.restoration), dict(given))
+        return self.info, self.scale, options
 
 
 @options
@@ -321,18 +339,6 @@ def check_file(path: Path, overwrite: bool, inputs: Iterable[Path | None]) -> No
     """``check_new`` for one file, which must be writable."""
     check_new([path], overwrite, inputs)
     check_writable(path)
-
-
-def full_scale_of(path: Path, info: "StackInfo", config: Config, option: float | None) -> float | None:
-    """Full scale of a stack: from the option, else from the file (or its 8-bit type), else from the configuration."""
-    if option is not None or not info.is_integer:
-        return option
-    if info.full_scale is None:
-        return config.full_scale
-    if info.dtype != "uint8" and config.full_scale not in (None, info.full_scale):
-        stated = f"{info.full_scale:g} in the file and {config.full_scale:g} in the configuration"
-        raise ValueError(f"{path}: the full scale is {stated}; choose one with --full-scale")
-    return info.full_scale
 
 
 def _restoration_options(info: "StackInfo", full_scale: float | None, options: Table, given: Table) -> Table:

@@ -38,15 +38,11 @@ def load(given: shared.StackCommand, restoration: Table | None = None) -> tuple[
 
     The frames are (T, H, W) or (T, C, H, W), full scale 1; the timing has the frame times of the file.
     """
-    path, config = given.stack, given.settings
-    info = io.read_stack_info(path)
-    scale = shared.full_scale_of(path, info, config, given.full_scale)
-    stacks.check_stack_fits(info, restoration, on_gpu=given.torch_device.type != "cpu")
-    with working(f"reading {path}"):
-        frames = io.read_stack(path, full_scale=scale)
-    timing = io.timing_from_first_frame(config.timing, info)
-    print_notes(info, config)
-    return frames.to(given.torch_device), timing
+    stacks.check_stack_fits(given.info, restoration, on_gpu=given.torch_device.type != "cpu")
+    with working(f"reading {given.stack}"):
+        frames = io.read_stack(given.stack, full_scale=given.scale)
+    print_notes(given.info, given.settings)
+    return frames.to(given.torch_device), io.timing_from_first_frame(given.settings.timing, given.info)
 
 
 def read_frame(path: Path, index: int, full_scale: float | None) -> Tensor:
@@ -155,18 +151,17 @@ def detect(given: DetectOptions) -> Answer:
     settings, frames, out = given.settings, given.stack, given.out
     answers.check_folder(out, (*answers.OF_DETECTION, *answers.OF_WINDOWS), given.overwrite, given.inputs)
     windows = {name: value for name, value in settings.stack.items() if name in ("window", "follow")} | given.windows
-    info = io.read_stack_info(frames)
-    count = info.shape[0]
+    count = given.info.shape[0]
     result, many = None, "window" in windows or windows.get("follow") is True or count > _LONG
     with whole_folder(out) as folder:
         if many:
-            print_notes(info, settings)
+            print_notes(given.info, settings)
         else:
             pixels, timing = load(given)
             result = _detect(pixels, timing, settings)
             may_change = windows.get("follow") is not False and stacks.may_change(result, count)
         if many or may_change:
-            stored = _detect_windows(given, info, folder / "manifest.json", windows)
+            stored = _detect_windows(given, folder / "manifest.json", windows)
             found = stored.detections()
             reliable = sum(0.0 if one is None else float(one.reliable.sum()) for one in found) / len(found)
             if result is not None and not reliable > float(result.reliable.sum()):
@@ -196,18 +191,16 @@ def detect(given: DetectOptions) -> Answer:
 _LONG = 256
 
 
-def _detect_windows(given: DetectOptions, info: io.StackInfo, manifest: Path, windows: Table) -> stacks.StackManifest:
+def _detect_windows(given: DetectOptions, manifest: Path, windows: Table) -> stacks.StackManifest:
     """Detect the vibration in the windows of a stack, and write the manifest."""
-    settings, frames = given.settings, given.stack
-    scale = shared.full_scale_of(frames, info, settings, given.full_scale)
-    with working(f"detecting in {frames.name}", counts=True) as progress:
+    with working(f"detecting in {given.stack.name}", counts=True) as progress:
         stacks.detect_stack(
-            frames,
+            given.stack,
             manifest,
-            settings.timing,
+            given.settings.timing,
             **windows,
-            detection=None if windows.get("follow") is True else settings.detection,
-            full_scale=scale,
+            detection=None if windows.get("follow") is True else given.settings.detection,
+            full_scale=given.scale,
             device=str(given.torch_device),
             progress=progress,
         )

@@ -39,7 +39,7 @@ class DisplacementSpectrum(
         **dict.fromkeys(("amplitude", "noise"), "px; of roll rad, of zoom 1"),
         "resolution": "Hz",
     },
-    shapes={"frequency": "F", "blind": "F", "amplitude": "A=2-4 F", "noise": "A F"},
+    shapes={"frequency": "F", "blind": "F", "amplitude": "A F", "noise": "A F"},
 ):
     """Amplitude spectrum and power spectral density (PSD) of the displacement, from ``DetectionResult.spectrum``.
 

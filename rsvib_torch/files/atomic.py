@@ -226,7 +226,7 @@ def _same(path: _Path, other: _Path) -> bool:
 def _conflict(output: _Path, source: _Path) -> str | None:
     """Why writing a file would change an input; None if it does not."""
     if _same(output, source):
-        return f"it is the same file as the input {source}"
+        return f"it is the input {source}"
     if _inside(source, output):
         return f"it contains the input {source}"
     if _inside(output, source):
@@ -250,7 +250,7 @@ def check_outputs(outputs: Iterable[_Path], inputs: Iterable[_Path], *, folder: 
     for source in inputs:
         places = [(f"cannot write {output}", output, "name") for output in outputs]
         if folder is not None and (os.path.isdir(source) or not _inside(source, folder)):
-            places.append((f"cannot write into {folder}", folder, "folder"))
+            places.insert(0, (f"cannot write into {folder}", folder, "folder"))
         for problem, place, remedy in places:
             reason = _conflict(place, source)
             if reason is not None:

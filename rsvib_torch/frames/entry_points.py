@@ -131,7 +131,8 @@ def entry_point(options: Any, function: Callable[..., Any]) -> Any:
         except (np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
             raise ValueError(
                 f"{function.__name__}: the frames do not determine the motion: they show too little detail, objects "
-                "that move by themselves, or are far apart in time; use other frames"
+                "that move by themselves, or are far apart in time; use other frames, or for a motion with constant "
+                "acceleration detect_vibration(..., image_acceleration=True)"
             ) from error
         except RuntimeError as error:
             if torch._C._functorch.peek_interpreter_stack() is None:  # no transform of torch.func

@@ -4,7 +4,7 @@ import csv
 import difflib
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
@@ -145,12 +145,18 @@ def find_cameras(search: str = "") -> tuple[CameraMode, ...]:
     return found
 
 
-def _unknown(name: str, modes: Iterable[CameraMode]) -> ValueError:
+def _unknown(name: str, modes: Sequence[CameraMode]) -> ValueError:
     """The error of a name that no model has, with the models of some modes or else of similar names."""
     names = {_letters(key): f"{mode.brand} {mode.model}" for mode in _modes() for key in (mode.model, mode.name)}
     near = difflib.get_close_matches(_letters(name), names, n=4)
-    similar = dict.fromkeys([f"{mode.brand} {mode.model}" for mode in modes] or [names[key] for key in near])
-    listed = ", ".join([*similar][:4]) or "none (rsvib cameras lists all)"
+    similar = [*dict.fromkeys([f"{mode.brand} {mode.model}" for mode in modes] or [names[key] for key in near])]
+    listed = ", ".join(similar[:4]) or "none (rsvib cameras lists all)"
+    if modes:
+        more = f" and {len(similar) - 4} more (rsvib cameras lists all)" if len(similar) > 4 else ""
+        return ValueError(
+            f"no camera in the table of readout times has exactly the name {quoted(name)}; names that contain it: "
+            f"{listed}{more}"
+        )
     return ValueError(f"no camera {quoted(name)} in the table of readout times; similar: {listed}")
 
 

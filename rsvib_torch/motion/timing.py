@@ -12,11 +12,9 @@ import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal
 
-from pydantic import model_validator
-
-from rsvib_torch.checks.validation import checked, options, validate
+from rsvib_torch.checks.validation import Positive, options, validate
 from rsvib_torch.checks.values import check_choice, check_number, check_whole_number, described
 from rsvib_torch.files.reading import read_toml
 
@@ -298,17 +296,17 @@ class SensorSection:
     ``frame_rows``).
     """
 
-    row_time: float
+    row_time: Positive
     """Time between the exposure starts of adjacent rows, in s. Data sheets call it line time or row period; 'rsvib
     calibrate' measures it with a flickering light. It is not 1 / (frame rate x rows), because sensors have blanking
     rows."""
-    exposure_time: float | None = None
+    exposure_time: Positive | None = None
     """Exposure time in s: the setting of the camera (shutter, integration time), not the frame period."""
-    exposure_rows: float | None = None
+    exposure_rows: Positive | None = None
     """Exposure time divided by row_time."""
-    frame_rate: float | None = None
+    frame_rate: Positive | None = None
     """Frames per second of the sensor. A slow-motion or time-lapse video is played at another rate."""
-    frame_rows: float | None = None
+    frame_rows: Positive | None = None
     """Frame period divided by row_time, blanking rows included: 1 / (frame rate x row_time)."""
     scan_axis: Literal["y", "x"] = "y"
     """'y' if image rows are exposed one after another, 'x' for image columns (a camera on its side)."""
@@ -319,21 +317,16 @@ class SensorSection:
     irregular clocks); strictly increasing."""
     row_time_std: float = 0.0
     """Standard deviation of row_time in s, which those of frequencies and amplitudes then contain."""
-    full_scale: float | None = None
+    full_scale: Positive | None = None
     """Count of a saturated pixel: 4095 for 12 bits, also in a 16-bit file."""
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        checked(self.to_timing)
-        if self.full_scale is not None:
-            check_number("full_scale", self.full_scale, above=0.0)
-        return self
+    def __post_init__(self) -> None:
+        self.to_timing()  # which checks the values
 
     def to_timing(self) -> SensorTiming:
         """The timing, with exposure and frame period in row times."""
-        row_time = check_number("row_time", self.row_time, above=0.0)
-        rate = self.frame_rate
-        if rate is not None and check_number("frame_rate", rate, above=0.0) < 0.1:
+        row_time, rate = self.row_time, self.frame_rate
+        if rate is not None and rate < 0.1:
             raise ValueError(f"frame_rate={rate:g} is less than 0.1; it is in frames per second, 1 / (frame period)")
         exposure = None if self.exposure_time is None else self.exposure_time / row_time
         period = None if rate is None else 1.0 / (rate * row_time)

@@ -100,7 +100,7 @@ def _check_values(values: dict[str, Tensor]) -> None:
 @dataclass(frozen=True, eq=False, repr=False)
 @checked_methods
 class Vibration(
-    Motion, units=_UNITS, shapes={**dict.fromkeys(_QUANTITIES, "... A=2-4 K"), **dict.fromkeys(_POLYNOMIAL, "... A")}
+    Motion, units=_UNITS, shapes={**dict.fromkeys(_QUANTITIES, "... A K"), **dict.fromkeys(_POLYNOMIAL, "... A")}
 ):
     """Sinusoidal displacement of the image on the sensor, with an image motion.
 
@@ -401,7 +401,7 @@ class VibrationStd(
     Result,
     units=_UNITS | {"displacement": "px"},
     shapes={
-        **dict.fromkeys(("amplitude", "frequency", "period", "phase"), "... A=2-4 K"),
+        **dict.fromkeys(("amplitude", "frequency", "period", "phase"), "... A K"),
         **dict.fromkeys(("image_motion", "image_acceleration", "displacement"), "... A"),
     },
 ):

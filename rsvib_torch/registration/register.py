@@ -45,7 +45,7 @@ class OffsetCurve(
     shapes={
         "pairs": "P 2",
         "rows": "N",
-        "offsets": "... P N A=2-4",
+        "offsets": "... P N A",
         "times": "[...] P N",
         "later_times": "[...] P N",
         "quality": "... P N",
@@ -171,11 +171,12 @@ def check_frame_size(num_rows: int, width: int, options: RegistrationOptions, pa
     """Refuse frames that are smaller than a band and its search range, or whose ``parts`` of the columns are."""
     rows, columns = _needed_size(options)
     if not fits_frame(num_rows, round(width / parts), options):
+        more_columns = ", or use more columns" if getattr(options, "columns", None) else ""
         of_columns = f" in {parts} parts of the columns, for roll, zoom or a lens," if parts > 1 else ""
         raise ValueError(
             f"frames of {num_rows} x {width} px (rows in readout order x px per row) are too small for bands of "
             f"{options.band_rows} rows{of_columns} searched over {options.search} px: at least {rows} x "
-            f"{parts * columns} are needed; reduce band_rows or search"
+            f"{parts * columns} are needed; reduce {'band_rows or ' * (num_rows < rows)}search{more_columns}"
         )
 
 

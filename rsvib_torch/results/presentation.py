@@ -299,7 +299,7 @@ class Result(Summarised):
             elif isinstance(value, Tensor) and name in self.shapes:
                 full = "_".join(dict.fromkeys((*inside, name)))  # offsets of the curve "offsets" are "offsets"
                 unit = {"units": self.units[name]} if name in self.units else {}
-                symbols = [entry.partition("=")[0] for entry in self.shapes[name].split() if "..." not in entry]
+                symbols = [entry for entry in self.shapes[name].split() if "..." not in entry]
                 batch = value.ndim - len(symbols)
                 dimensions = ["index"] if batch == 1 else [f"index_{number}" for number in range(batch)]
                 dimensions += [_DIMENSIONS.get(symbol, f"{full}_{symbol.lower()}") for symbol in symbols]

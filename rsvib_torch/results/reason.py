@@ -118,6 +118,7 @@ _OPTIONS = {
     "pass row_time=(low, high)": "give --row-time twice",
     "scan_axis=": "--scan-axis ",
     "readout_direction=": "--readout-direction ",
+    "detect_vibration with image_acceleration=True": "rsvib detect with image_acceleration = true in [detection]",
     "roll=True, zoom=True and no columns": "no columns, and true for roll and zoom, in [detection]",
 }
 _of_program: list[bool] = []  # not empty while a command runs
@@ -338,6 +339,7 @@ _SHAPES = {
     ),
     "motion_uncertain": _px(
         "the motion is determined to {value:.3g} px only, {limit:g} px are needed: frames may show different scenes",
+        "use detect_vibration with image_acceleration=True if the motion has a constant acceleration",
         compares="rms standard deviation of the visible part of the motion, above 0.3 px",
     ),
     "common_motion_uncertain": _px(

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import check_fields, hints_of
-from rsvib_torch.checks.validation import members_of
+from rsvib_torch.checks.values import members_of
 from rsvib_torch.files.atomic import whole_file
 from rsvib_torch.files.reading import Table
 from rsvib_torch.results.reason import read_findings
@@ -24,10 +24,13 @@ if TYPE_CHECKING:
 
 def result_of(kind: type[Any], data: Table, path: Path) -> Any:
     """A result of a class from the content of a file that ``Result.save`` wrote, see ``Result.load``."""
-    if data.get("format") != kind.file_format or data.get("version") != 1:
+    found = str(data.get("format"))
+    if found != kind.file_format or data.get("version") != 1:
+        content = {"rsvib vibration": "DetectionResult", "rsvib stack": "StackManifest"}.get(found, found[6:])
+        reader = f", which {content}.load reads" if content[:1].isupper() and found != kind.file_format else ""
         raise ValueError(
             f"{path}: expected format {kind.file_format!r} of version 1, as {kind.__name__}.save writes it, got "
-            f"{quoted(data.get('format'))} of version {quoted(data.get('version'))}"
+            f"{quoted(found)} of version {quoted(data.get('version'))}{reader}"
         )
     try:
         return decode(kind, data, "")

@@ -346,7 +346,7 @@ def test_workers_sample_independently_and_reproducibly():
         ({"frequency": "fast"}, TypeError, "frequency must be a number, \\(low, high\\)"),
         ({"exposure_rows": (20, 400)}, ValueError, "exposure_rows must be at most 320"),
         ({"roll": ((0.0, 1.0), (0.0, 1.0))}, TypeError, "roll must be a number or"),
-        ({"interpolation": "nearest"}, ValueError, "interpolation must be one of"),
+        ({"interpolation": "nearest"}, ValueError, "interpolation must be 'linear' or 'cubic'"),
     ],
 )
 def test_bad_options(options, error, match):

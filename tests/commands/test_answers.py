@@ -230,6 +230,13 @@ def test_help_contains_every_text_and_two_examples(capsys, monkeypatch, command)
     assert max(map(len, text.splitlines())) <= 100
 
 
+@pytest.mark.parametrize("module", ["rsvib_torch", "rsvib_torch.commands.main"])
+def test_modules_that_are_the_program(module):
+    command = [sys.executable, "-m", module, "--version"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout == f"rsvib {rsv.__version__}\n"
+
+
 def test_shell_completion():
     environment = os.environ | {"_RSVIB_COMPLETE": "complete_bash", "COMP_WORDS": "rsvib re", "COMP_CWORD": "1"}
     done = subprocess.run([PROGRAM], env=environment, capture_output=True, text=True, check=True)

@@ -75,7 +75,12 @@ def test_table_has_no_row_that_contradicts_itself():
     ("name", "size", "message"),
     [
         ("iPhnoe 12", (3840, 2160, 60), "no camera 'iPhnoe 12' .*; similar: Apple iPhone 12"),
-        ("iPhone 7", (3840, 2160, 30), "no camera 'iPhone 7' .*; similar: Apple iPhone 7 Plus"),  # another camera
+        (
+            "iPhone 7",
+            (3840, 2160, 30),
+            "exactly the name 'iPhone 7'; names that contain it: Apple iPhone 7 Plus",
+        ),  # another camera
+        ("GoPro", (3840, 2160, 30), "names that contain it: GoPro HERO, GoPro HERO5 Black, .* and 1 more"),
         ("iPhone 12", (1920, 1080, 24), "several modes fit.*: Apple iPhone 12 Ultra Wide, Apple iPhone 12 Wide"),
         ("iPhone 12", (1920, 1080, 60), "no mode .* 1920 x 1080 px at 60/s: 3840 x 2160 px at 60/s, "),  # half the size
         ("iPhone 12", (3840, 2160, 30), "no mode of Apple iPhone 12"),  # another rate

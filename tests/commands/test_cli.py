@@ -173,7 +173,7 @@ def test_options_of_restoration_come_from_config_or_command_line(place, tmp_path
     at_rest = read_stack(place / "scene.png")[0, 32:-32, 32:-32]
     assert decibel(read_stack(out / "restored.tif")[0], at_rest.numpy()) > 40
     for options, message in (
-        (("--method", "dewarp", "--joint", "2"), "method='dewarp' has no option 'joint'; its options are chunk_rows"),
+        (("--method", "dewarp", "--joint", "2"), "--joint is no option of method='dewarp'; its options are chunk_rows"),
         (("--method", "exact", "--joint", "many"), "--joint must be 'all' or a number of frames, got 'many'"),
     ):
         assert message in refused(capsys, *common, *options)
@@ -187,8 +187,10 @@ def test_full_scale_comes_from_option_file_or_config(place, tmp_path, capsys):
     silent = tmp_path / "silent.toml"
     silent.write_text(CONFIG.replace("full_scale = 4095", ""))
     assert rsvib("detect", arguments[0], "--config", silent, "--out", tmp_path / "o", "--full-scale", 4095) == 0
-    unknown = refused(capsys, "detect", arguments[0], "--config", silent, "--out", tmp_path / "out2")
-    assert "full scale of uint16 frames unknown: pass full_scale, e.g. full_scale=4095" in unknown
+    found = ("--vibration", tmp_path / "out" / "vibration.json")
+    for command in (("detect", "--out", tmp_path / "out2"), ("restore", tmp_path / "r.tif", *found)):
+        unknown = refused(capsys, command[0], arguments[0], *command[1:], "--config", silent)
+        assert "plain.tif: the full scale of its uint16 counts is not known: give --full-scale, e.g. 4095" in unknown
     other = tmp_path / "other.toml"
     other.write_text(CONFIG.replace("4095", "16383"))
     two = refused(capsys, "detect", place / "frames.tif", "--config", other, "--out", tmp_path / "out2")
@@ -241,7 +243,7 @@ def bad_inputs(place):
         ("run", "cut.tif", "camera.toml", "cut.tif: not a readable TIFF stack: "),
         ("run", "none.tif", "camera.toml", "none.tif does not exist"),
         ("detect", "frames.tif", "none.toml", "none.toml: No such file or directory"),
-        ("detect", "frames.tif", "wrong.toml", "detection.search: expected at least 2, got 1"),
+        ("detect", "frames.tif", "wrong.toml", "detection.search must be at least 2, got 1"),
     ],
 )
 def test_errors_of_bad_input_are_one_line_and_leave_no_files(

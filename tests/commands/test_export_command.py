@@ -70,7 +70,7 @@ def test_axes_that_are_not_reliable_are_left_out(place, tmp_path, capsys):
     ("arguments", "message"),
     [
         (("vibration.json", "clip.xyz"), "give --format gcsv or csv"),
-        (("vibration.json", "vibration.json", "--format", "csv"), "it is the same file as the input"),
+        (("vibration.json", "vibration.json", "--format", "csv"), "it is the input"),
         (("vibration.json", "clip.gcsv", "--focal-length", "900"), "give --frames, or --size and --num-frames"),
     ],
 )

@@ -71,7 +71,7 @@ def test_a_file_at_its_own_rate(clip, capsys):
         (("0", "--frames", "5:9"), "--frames goes with a file, not with 0; --num-frames ends a session"),
         (("none.mp4",), "none.mp4: no such file; a camera is a number or a URL"),
         (("CLIP", "--out", "still.gif"), "a live video is written to .mp4, .mov, .m4v or .mkv"),
-        (("CLIP", "--out", "CLIP", "--overwrite"), "it is the same file as the input"),
+        (("CLIP", "--out", "CLIP", "--overwrite"), "it is the input"),
         (("CLIP", "--steady", "1"), "rsvib run FRAMES OUT --video --steady 1 --border mirror"),
         (("0", "--border", "crop"), "--border crop needs frames that come later"),
     ],

@@ -59,8 +59,8 @@ def test_report_of_a_finer_grid(place, tmp_path):
     [
         (("--mosaic", "RGB"), "'RGB' is not one of 'RGGB', 'BGGR', 'GRBG', 'GBRG'"),
         (("--optics-sigma", -1), "error: --optics-sigma must be at least 0, got -1.0"),
-        (("--optics-sigma", 0.4, "--method", "dewarp"), "method='dewarp' has no option 'optics'; its options are"),
-        (("--scale", 3), "scale must be one of 1, 2; got 3"),
+        (("--optics-sigma", 0.4, "--method", "dewarp"), "is no option of method='dewarp'; its options are"),
+        (("--scale", 3), "--scale must be 1 or 2, got 3"),
     ],
 )
 def test_errors(place, tmp_path, capsys, more, message):

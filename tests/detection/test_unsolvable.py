@@ -6,6 +6,7 @@ import pytest
 import torch
 
 import rsvib_torch as rsv
+from rsvib_torch.datasets import city_and_fields
 
 SIZE = 128
 TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=140)
@@ -45,3 +46,18 @@ def test_independent_noise_at_a_low_frame_rate_has_no_vibration():
     found = rsv.detect_vibration(noise, rsv.SensorTiming(50e-6, 10, 1600))
     assert not found.reliable.any()
     assert all("rows_not_registered" in [reason.code for reason in against] for against in found.findings)
+
+
+def test_too_few_columns_name_the_remedy_that_helps():
+    frames = torch.rand(2, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
+    with pytest.raises(ValueError, match=r"at least 64 x 96 are needed; reduce search, or use more columns$"):
+        rsv.detect_vibration(frames, TIMING, columns=64)
+
+
+def test_an_acceleration_that_is_no_free_motion_names_the_remedy():
+    """The frames are 160 px apart at the end."""
+    vibration = rsv.Vibration(0.0, 0.0, image_acceleration=(4000.0, 1000.0))
+    timing = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=200)
+    frames = rsv.simulate_frames(city_and_fields(640, 630, seed=3), timing, vibration, 12, frame_size=(160, 150))
+    with pytest.raises(ValueError, match=r"constant acceleration detect_vibration\(..., image_acceleration=True\)"):
+        rsv.detect_motion(frames, timing)

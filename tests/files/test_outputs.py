@@ -32,14 +32,14 @@ def make_place(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("output", "source", "reason"),
     [
-        ("frames.tif", "frames.tif", "the same file as the input"),
-        ("pngs/../frames.tif", "frames.tif", "the same file as the input"),
-        ("link.tif", "frames.tif", "the same file as the input"),
-        ("frames.tif", "link.tif", "the same file as the input"),
-        ("hard.tif", "frames.tif", "the same file as the input"),
-        ("missing.tif", "dangling.tif", "the same file as the input"),
-        ("pngs", "pngs", "the same file as the input"),
-        ("linked", "pngs", "the same file as the input"),
+        ("frames.tif", "frames.tif", "it is the input "),
+        ("pngs/../frames.tif", "frames.tif", "it is the input "),
+        ("link.tif", "frames.tif", "it is the input "),
+        ("frames.tif", "link.tif", "it is the input "),
+        ("hard.tif", "frames.tif", "it is the input "),
+        ("missing.tif", "dangling.tif", "it is the input "),
+        ("pngs", "pngs", "it is the input "),
+        ("linked", "pngs", "it is the input "),
         ("pngs/new.tif", "pngs", "inside the input folder"),
         ("linked/deep/new.tif", "pngs", "inside the input folder"),
         ("pngs/new/deep/x.tif", "linked", "inside the input folder"),
@@ -58,6 +58,11 @@ def test_outputs_that_change_an_input_are_refused(place, output, source, reason)
     assert message.startswith(f"cannot write {output}: ")
     assert source in message
     assert "\n" not in message
+
+
+def test_a_folder_of_results_that_is_the_input(place):
+    with pytest.raises(ValueError, match="cannot write into pngs: it is the input pngs; choose another folder"):
+        check_outputs(["pngs/vibration.json"], ["pngs"], folder="pngs")
 
 
 @pytest.mark.parametrize(

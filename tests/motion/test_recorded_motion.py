@@ -55,7 +55,7 @@ def changed(place, time):
         (CLOCK, 20 * CLOCK, {"unit": "rad", "focal_length": 1000}, "check unit='rad'"),
         (CLOCK, 300 * CLOCK, {"unit": "rad/s", "focal_length": 1000}, "check unit='rad/s'"),
         (CLOCK, CLOCK, {"unit": "rad"}, "needs a focal_length"),
-        (CLOCK, CLOCK, {"unit": "feet"}, "unit must be one of"),
+        (CLOCK, CLOCK, {"unit": "feet"}, "unit must be '"),
         (CLOCK[:3], CLOCK[:3], {}, "3 samples"),
     ],
 )

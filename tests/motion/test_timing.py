@@ -51,7 +51,7 @@ def test_scan_axis_names(given, kept):
         ({"row_time": "20us"}, TypeError, "row_time must be a number, got '20us'"),
         ({"exposure_rows": 2049}, ValueError, "exposure_rows=2049 exceeds the frame period"),
         ({"scan_axis": 0}, ValueError, r"scan_axis must be -2 \('y'\) or -1 \('x'\), got 0"),
-        ({"readout_direction": "up"}, ValueError, "readout_direction must be one of 'forward', 'reverse'; got 'up'"),
+        ({"readout_direction": "up"}, ValueError, "readout_direction must be 'forward' or 'reverse', got 'up'"),
         ({"frame_start_times": [0.0, 0.2, 0.1]}, ValueError, "frame_start_times must be strictly increasing"),
     ],
 )

@@ -68,6 +68,15 @@ def test_vibration_of_another_timing_is_refused(tmp_path, result, timing):
     assert str(caught.value).count("(here") == 1
 
 
+def test_files_of_other_results_name_their_reader(tmp_path, result):
+    result.save(tmp_path / "detection.json")
+    result.vibration.save(tmp_path / "vibration.json")
+    with pytest.raises(ValueError, match=r"got 'rsvib vibration' of version 1, which DetectionResult\.load reads"):
+        Vibration.load(tmp_path / "detection.json")
+    with pytest.raises(ValueError, match=r"got 'rsvib Vibration' of version 1, which Vibration\.load reads"):
+        DetectionResult.load(tmp_path / "vibration.json")
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
