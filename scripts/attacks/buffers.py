@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from attacks.trial import Trial
 from attacks.warm import in_warm_child
-from test_shared_memory import CASES, FRAMES, ONLY_TENSORS, TIMING, test_results_share_no_memory_with_arguments
+from test_all_functions import CASES, FRAMES, ONLY_TENSORS, TIMING, test_results_share_no_memory_with_arguments
 
 import rsvib_torch as rsv
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from truth import Motion, recorded
+from truth import Curve, Motion, recorded
 
 from rsvib_torch import SensorTiming, detect_vibration
 
@@ -14,16 +14,15 @@ TIMING = SensorTiming(row_time=1 / (RATE * 230), exposure_rows=8, frame_rows=230
 MOTION = Motion((1.4, 1.1), (53.0, 65.0), (0.4, 1.3))
 
 
-class Walk(Motion):
+@Curve
+def walk(times):
     """Sums of 60 tones below 40 Hz, which no four tones explain."""
-
-    def displacement(self, times):
-        generator = np.random.default_rng(5)
-        frequency = generator.uniform(2.0, 40.0, (2, 60))
-        amplitude = generator.standard_normal((2, 60)) / frequency
-        phase = generator.uniform(-3.0, 3.0, (2, 60))
-        waves = amplitude * np.sin(2 * np.pi * frequency * times[:, None, None] + phase)
-        return 1.5 * waves.sum(-1) / np.linalg.norm(amplitude, axis=-1)
+    generator = np.random.default_rng(5)
+    frequency = generator.uniform(2.0, 40.0, (2, 60))
+    amplitude = generator.standard_normal((2, 60)) / frequency
+    phase = generator.uniform(-3.0, 3.0, (2, 60))
+    waves = amplitude * np.sin(2 * np.pi * frequency * times[:, None, None] + phase)
+    return 1.5 * waves.sum(-1) / np.linalg.norm(amplitude, axis=-1)
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +88,7 @@ def test_a_wrong_readout_is_named(frames, wrong, code, agreeing):
 
 
 def test_a_motion_that_is_no_sum_of_tones_names_no_timing():
-    found = detect_vibration(recorded((HEIGHT, WIDTH), TIMING, Walk(), 4, 0.005, seed=8), TIMING)
+    found = detect_vibration(recorded((HEIGHT, WIDTH), TIMING, walk, 4, 0.005, seed=8), TIMING)
     codes = {reason.code for of_axis in found.findings for reason in of_axis}
     assert codes & {"rows_unexplained", "neighbours_unexplained", "too_many_tones"}
     assert causes(found) == []

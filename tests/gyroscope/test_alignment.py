@@ -7,7 +7,7 @@ import pytest
 import torch
 from program import refused, rsvib
 from refusals import refuses
-from truth import MARGIN, Curve, Motion, crop, decibel, draw_scene, take_frames
+from truth import MARGIN, Curve, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
 
@@ -26,9 +26,9 @@ def angles(clock):
     return np.stack([x, y], axis=-1)
 
 
-class HandShake(Motion):
-    def displacement(self, times):
-        return FOCAL_LENGTH * np.tan(angles(SPEED * times + CLOCK)) + np.asarray(DRIFT) * times[..., None]
+@Curve
+def hand_shake(times):
+    return FOCAL_LENGTH * np.tan(angles(SPEED * times + CLOCK)) + np.asarray(DRIFT) * times[..., None]
 
 
 @pytest.fixture(scope="module", name="scene")
@@ -38,7 +38,7 @@ def make_scene():
 
 @pytest.fixture(scope="module", name="frames")
 def make_frames(scene):
-    return torch.from_numpy(take_frames(scene, TIMING, HandShake(), FRAMES, 0.005)).float()
+    return torch.from_numpy(take_frames(scene, TIMING, hand_shake, FRAMES, 0.005)).float()
 
 
 def log(path, clock, values, header="time,x,y"):
@@ -65,14 +65,14 @@ def test_clock_offset_and_drift_are_estimated_and_frames_restored(scene, frames,
     assert abs(found.scale - SPEED) < 4 * found.scale_std
     assert found.drift.tolist() == pytest.approx(DRIFT, abs=0.5)
     times = TIMING.row_starts(FRAMES, HEIGHT) + 0.5 * TIMING.exposure_time
-    error = found.motion.displacement(times).numpy() - HandShake().displacement(times.numpy())
+    error = found.motion.displacement(times).numpy() - hand_shake.displacement(times.numpy())
     assert np.abs(error - error.mean((0, 1))).max() < 0.05
     shift = torch.from_numpy(error.mean((0, 1)))[:, None]
     placed = rsv.FreeMotion(
         found.motion.coefficients - shift, found.motion.start, found.motion.spacing, found.motion.tones
     )
     truth = rsv.FreeMotion.from_samples(
-        times.flatten(), torch.from_numpy(HandShake().displacement(times.flatten().numpy()))
+        times.flatten(), torch.from_numpy(hand_shake.displacement(times.flatten().numpy()))
     )
     best, here = (decibel(rsv.restore(frames, TIMING, m).numpy(), crop(scene)) for m in (truth, placed))
     assert here > best - 0.3
@@ -88,7 +88,7 @@ def test_wrong_focal_length_is_corrected(frames, gyroscope):
 
 def test_columns_as_scan_axis(scene, gyroscope, tmp_path):
     timing = rsv.SensorTiming(6e-5, 20, 300, scan_axis=-1, readout_direction="reverse")
-    frames = torch.from_numpy(take_frames(scene, TIMING, HandShake(), FRAMES, 0.005)).float().flip(-2).transpose(-2, -1)
+    frames = torch.from_numpy(take_frames(scene, TIMING, hand_shake, FRAMES, 0.005)).float().flip(-2).transpose(-2, -1)
     clock = np.arange(811.9, 813.4, 1e-3)
     path = log(tmp_path / "angles.csv", clock, np.degrees(angles(clock)[:, ::-1]))
     recorded = rsv.read_motion(path, unit="deg", focal_length=FOCAL_LENGTH, signs=(-1, 1))
@@ -161,7 +161,7 @@ def test_command(frames, gyroscope, tmp_path, capsys):
 
 
 def at(times, factor=1.0):
-    return rsv.FreeMotion.from_samples(times, factor * HandShake().displacement(times))
+    return rsv.FreeMotion.from_samples(times, factor * hand_shake.displacement(times))
 
 
 def test_correct_motion_explains_the_offsets_and_wrong_motions_do_not(frames):

@@ -123,20 +123,21 @@ def test_output_row_selects_its_kernel(interpolation):
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
-@pytest.mark.parametrize("scene_lead", [(), (3,), (2, 1), (2, 3)])
-def test_adjoint_of_batches(interpolation, scene_lead):
+@pytest.mark.parametrize(("scene_lead", "origin"), [((), (0, 0)), ((3,), (1, -2)), ((2, 1), (0, 0)), ((2, 3), (-3, 4))])
+def test_adjoint_of_batches(interpolation, scene_lead, origin):
+    """<A x, y> = <x, A^T y>."""
     psf = small_psf(interpolation, batch=3)
     scene = noise(*scene_lead, 24, 28, seed=1)
-    frame = blur_rows(scene, psf, frame_width=18)
+    frame = blur_rows(scene, psf, frame_width=18, origin=origin)
     lead = torch.broadcast_shapes(scene_lead, (3,))
     assert frame.shape == (*lead, 14, 18)
     other = noise(*frame.shape, seed=2)
-    back = blur_rows_adjoint(other, psf, tuple(scene.shape))
+    back = blur_rows_adjoint(other, psf, tuple(scene.shape), origin=origin)
     assert back.shape == scene.shape
     assert (frame * other).sum().item() == pytest.approx((scene * back).sum().item(), rel=1e-11)
     for index in range(3):
         one = RowPSF(psf.first_tap[index], psf.weights[index], psf.degree)
-        expected = blur_rows(scene.expand(*lead, 24, 28)[..., index, :, :], one, frame_width=18)
+        expected = blur_rows(scene.expand(*lead, 24, 28)[..., index, :, :], one, frame_width=18, origin=origin)
         torch.testing.assert_close(frame[..., index, :, :], expected, rtol=0, atol=1e-12)
 
 

@@ -55,19 +55,6 @@ def test_scene_too_small():
     refuses(lambda: simulate_frames(scene, TIMING, Vibration(40.0, 50.0)), "is too small")
 
 
-@pytest.mark.parametrize(
-    ("scene", "options", "error", "message"),
-    [
-        (torch.zeros(99, 99, dtype=torch.uint8), {}, TypeError, "scene must be a floating-point tensor"),
-        (torch.full((99, 99), torch.nan), {}, ValueError, "scene must be finite, but pixel"),
-        (torch.zeros(600, 99), {"frame_size": (400, 50)}, ValueError, "frame_rows=300 is less than the"),
-        (torch.zeros(99, 99), {"vibration": Vibration.still((2,))}, ValueError, "vibration is a batch of shape"),
-    ],
-)
-def test_bad_input(scene, options, error, message):
-    refuses(lambda: simulate_frames(scene, TIMING, **{"vibration": Vibration(1.0, 50.0), **options}), message, error)
-
-
 def test_read_and_shot_noise_have_their_variance():
     generator = torch.Generator().manual_seed(3)
     frames = torch.full((400, 500), 0.3, dtype=torch.float64)

@@ -121,18 +121,6 @@ def test_files_keep_the_camera(tmp_path):
         assert type(motion).load(tmp_path / "motion.json").camera == motion.camera
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"focal_length": 0.0}, "focal_length must be"),
-        ({"focal_length": 500.0, "distortion": (0.1, 0.2)}, "distortion must be 5 numbers"),
-        ({"focal_length": 500.0, "distortion": (0.1,) * 5, "fisheye": True}, "distortion must be 4 numbers"),
-    ],
-)
-def test_bad_cameras_are_refused(arguments, message):
-    refuses(lambda: rsv.Camera(**arguments), message, (ValueError, TypeError))
-
-
 # Format of the files in https://github.com/gyroflow/lens_profiles.
 PROFILE = {
     "calib_dimension": {"w": 3840, "h": 2160},

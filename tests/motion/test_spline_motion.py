@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from refusals import refuses
 from scipy.interpolate import CubicSpline
 from truth import MARGIN, Curve, decibel, draw_scene, take_frames
 
@@ -68,20 +67,3 @@ def test_simulated_frames_equal_those_of_the_independent_simulator():
     scene = draw_scene(320 + 2 * MARGIN, 192 + 2 * MARGIN, 2)
     frames = rsv.simulate_frames(torch.from_numpy(scene), TIMING, motion(), 2, frame_size=(320, 192))
     assert decibel(frames.numpy(), take_frames(scene, TIMING, FREE, 2), rim=16) > 60
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ((torch.zeros(2, 3), 0.0, 1e-3), "N >= 4"),
-        ((torch.full((2, 8), torch.nan), 0.0, 1e-3), "finite"),
-        ((torch.zeros(2, 8), 0.0, 1e-3, rsv.Vibration.still((3,))), "batch shape"),
-    ],
-)
-def test_bad_values(arguments, message):
-    refuses(lambda: FreeMotion(*arguments), message)
-
-
-def test_bad_samples():
-    refuses(lambda: FreeMotion.through([0.0, 1.0, 2.0, 4.0], torch.zeros(4, 2)), "evenly spaced")
-    refuses(lambda: FreeMotion.from_samples([0.0, 1.0, 1.0, 4.0], torch.zeros(4, 2)), "strictly increasing")

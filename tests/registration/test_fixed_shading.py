@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from scipy import ndimage
-from truth import MARGIN, Motion, draw_scene, take_frames
+from truth import MARGIN, Curve, draw_scene, take_frames
 
 import rsvib_torch as rsv
 
@@ -12,22 +12,21 @@ SIZE = 256
 TIMING = rsv.SensorTiming(row_time=1 / 30 / SIZE, exposure_rows=1, frame_rows=SIZE)
 
 
-class Wander(Motion):
+@Curve
+def wander(times):
     """Drift of an eye: steps of a random walk smoothed over a fifth of a frame, no sinusoid."""
-
-    def displacement(self, times):
-        generator = np.random.default_rng(8)
-        grid = np.arange(-0.2, 0.8, 1e-3)
-        walk = np.cumsum(generator.standard_normal((len(grid), 2)), axis=0)
-        path = ndimage.gaussian_filter1d(walk, 6.0, axis=0)
-        path = 2.5 * (path - path.mean(0)) / path.std(0)
-        return np.stack([np.interp(times, grid, path[:, axis]) for axis in range(2)], axis=-1)
+    generator = np.random.default_rng(8)
+    grid = np.arange(-0.2, 0.8, 1e-3)
+    walk = np.cumsum(generator.standard_normal((len(grid), 2)), axis=0)
+    path = ndimage.gaussian_filter1d(walk, 6.0, axis=0)
+    path = 2.5 * (path - path.mean(0)) / path.std(0)
+    return np.stack([np.interp(times, grid, path[:, axis]) for axis in range(2)], axis=-1)
 
 
 @pytest.fixture(scope="module", name="recording")
 def make_recording():
     scene = draw_scene(SIZE + 2 * MARGIN, SIZE + 2 * MARGIN, 4)
-    motion = Wander()
+    motion = wander
     frames = take_frames(scene, TIMING, motion, 4)
     v, u = np.meshgrid(np.linspace(-1, 1, SIZE), np.linspace(-1, 1, SIZE), indexing="ij")
     vignette = 0.1 + 0.9 * np.exp(-(u**2 + v**2) / 0.35)

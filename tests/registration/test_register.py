@@ -1,4 +1,3 @@
-from dataclasses import replace
 from typing import get_args
 
 import numpy as np
@@ -154,49 +153,3 @@ def test_offsets_do_not_depend_on_brightness_and_contrast(pair, paper_camera, me
     one = register_bands(frames, paper_camera, method=method).offsets
     other = register_bands(changed, paper_camera, method=method).offsets
     torch.testing.assert_close(one, other, rtol=0, atol=2e-3, equal_nan=True)
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_batch_channels_and_pairs_equal_singles(pair, paper_camera, method):
-    frames = pair[0][:, :512, :256]
-    three = torch.cat([frames, frames[:1]])
-    other = three.flip(-1)
-    batch = torch.stack([three, other])[:, :, None].repeat(1, 1, 2, 1, 1)
-    together = register_bands(batch, paper_camera, method=method)
-    assert together.offsets.shape[:2] == (2, 2)
-    assert together.pairs.tolist() == [[0, 1], [1, 2]]
-    for index, stack in enumerate((three, other)):
-        for p in range(2):
-            alone = register_bands(stack[p : p + 2], paper_camera, method=method)
-            torch.testing.assert_close(together[index].offsets[p], alone.offsets[0], rtol=0, atol=2e-4, equal_nan=True)
-            torch.testing.assert_close(together[index].quality[p], alone.quality[0], rtol=0, atol=1e-4)
-
-
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("scan_axis", [-2, -1])
-def test_orientation(pair, paper_camera, method, scan_axis):
-    frames = pair[0][:, :512, :256]
-    upright = register_bands(frames, paper_camera, method=method)
-    turned = frames.flip(-2) if scan_axis == -2 else frames.flip(-2).transpose(-2, -1)
-    timing = replace(paper_camera, scan_axis=scan_axis, readout_direction="reverse")
-    result = register_bands(turned, timing, method=method)
-    expected = upright.offsets * torch.tensor([1.0, -1.0])
-    expected = expected.flip(-1) if scan_axis == -1 else expected
-    torch.testing.assert_close(result.offsets, expected, rtol=0, atol=1e-6, equal_nan=True)
-    assert torch.equal(result.rows, upright.rows)
-    assert torch.equal(result.times, upright.times)
-    assert result.heights == (upright.heights[::-1] if scan_axis == -1 else upright.heights)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"method": "sift"}, "registration must be one of 'projection', 'ncc', 'phase'; got 'sift'"),
-        ({"search": 60}, "frames of 256 x 200 px .* bands of 32 rows searched over 60 px"),
-        ({"band_rows": 240}, "too small for bands of 240 rows"),
-    ],
-)
-def test_bad_options(paper_camera, options, message):
-    frames = torch.rand(2, 256, 200, generator=torch.Generator().manual_seed(0))
-    with pytest.raises(ValueError, match=message):
-        register_bands(frames, paper_camera, **options)

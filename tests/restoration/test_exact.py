@@ -1,9 +1,12 @@
+"""Method ``"exact"``: accuracy, segments and gradients, the prior of edges, and the strength of the prior."""
+
 from functools import partial
 
 import numpy as np
 import pytest
 import torch
 from exact_steps import model_of, solved
+from scipy import fft, ndimage
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration, psnr, simulate_frames
@@ -11,11 +14,13 @@ from rsvib_torch.datasets import city_and_fields
 from rsvib_torch.restoration import restore as restore_by_any_method
 from rsvib_torch.restoration import visible_pixels
 from rsvib_torch.restoration.exact.exact import model_frames
-from rsvib_torch.restoration.exact.priors import PRIORS, Prior
+from rsvib_torch.restoration.exact.priors import PRIORS, Prior, shrink_patches
 from rsvib_torch.restoration.exact.scene_solver import Partition
 from rsvib_torch.restoration.frame_motion import MovingFrames, frame_motion
+from rsvib_torch.restoration.scene_model.scene_prior import fit_prior
 
 restore = partial(restore_by_any_method, method="exact")
+quietly = partial(restore, check=False)
 TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
 
 
@@ -197,3 +202,146 @@ def test_a_batch_equals_single_stacks(rows, joint):
     together = restore(frames[:, :, None], timing, Vibration.stacked(motions), joint=joint, check=False)
     for images, motion, found in zip(frames, motions, together[:, :, 0], strict=True):
         torch.testing.assert_close(found, restore(images, timing, motion, joint=joint, check=False), rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("offset", [(0, 0), (1, 0), (1, 1)])
+def test_patches_agree_with_a_loop_over_dct(offset):
+    image = np.random.default_rng(0).standard_normal((71, 13))  # more rows than are shrunk at a time
+    padded = np.pad(image, 8, mode="edge")
+    total, weights = np.zeros_like(padded), np.zeros_like(padded)
+    for row in range(offset[0], padded.shape[0] - 7, 2):
+        for column in range(offset[1], padded.shape[1] - 7, 2):
+            patch = fft.dctn(padded[row : row + 8, column : column + 8], norm="ortho")
+            strong = abs(patch) > 2.0 * 0.6
+            strong[0, 0] = True
+            total[row : row + 8, column : column + 8] += fft.idctn(patch * strong, norm="ortho") / strong.sum()
+            weights[row : row + 8, column : column + 8] += 1 / strong.sum()
+    found = shrink_patches(torch.from_numpy(image)[None], 0.6, offset)[0].numpy()
+    np.testing.assert_allclose(found, total[8:-8, 8:-8] / weights[8:-8, 8:-8], rtol=0, atol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def buildings():
+    scene = draw_scene(272, 240, seed=41)
+    frames = torch.from_numpy(take_frames(scene, TIMING, Motion(), 2, 0.02)).float()
+    return crop(scene), frames
+
+
+@pytest.fixture(scope="module")
+def step():
+    scene = np.full((256, 256), 0.25)
+    scene[128:] = 0.75
+    scene = ndimage.gaussian_filter(scene, 0.8)
+    timing = SensorTiming(row_time=20.52e-6, exposure_rows=100, frame_rows=2048)
+    frames = torch.from_numpy(take_frames(scene, timing, Motion(), 2, 0.02)).float()
+    return crop(scene), frames, timing
+
+
+@pytest.mark.parametrize("joint", [False, True])
+def test_psnr_exceeds_that_of_the_gaussian_prior(buildings, joint):
+    truth, frames = buildings
+    plain = quietly(frames, TIMING, Motion().vibration(), joint=joint)
+    kept = quietly(frames, TIMING, Motion().vibration(), joint=joint, prior="edges")
+    assert kept.shape == plain.shape
+    assert decibel(kept, truth) > decibel(plain, truth) + 0.15
+
+
+@pytest.mark.parametrize(("exposure_rows", "joint"), [(100, False), (400, True)])
+def test_psnr_exceeds_that_of_the_gaussian_prior_under_blur(joint, exposure_rows):
+    scene = draw_scene(272, 240, seed=5)
+    timing = SensorTiming(row_time=20.52e-6, exposure_rows=exposure_rows, frame_rows=2048)
+    frames = torch.from_numpy(take_frames(scene, timing, Motion(), 2, 0.02)).float()
+    plain, kept = (
+        quietly(frames, timing, Motion().vibration(), joint=joint, prior=prior) for prior in ("gaussian", "edges")
+    )
+    assert decibel(kept, crop(scene)) > decibel(plain, crop(scene)) + 0.2
+
+
+def test_steps_have_less_overshoot_and_noise(step):
+    truth, frames, timing = step
+    plain, kept = (
+        quietly(frames[:1], timing, Motion().vibration(), prior=prior)[0].numpy() for prior in ("gaussian", "edges")
+    )
+    overshoots = []
+    for image in (plain, kept):
+        profile = image[32:-32, 32:-32].mean(1)
+        overshoots.append(max(profile.max() - 0.75, 0.25 - profile.min()))
+    assert overshoots[1] < overshoots[0]
+    assert decibel(kept, truth) > decibel(plain, truth) + 4
+
+
+def test_gradients_to_frames_and_flat_scenes():
+    flat = torch.full((1, 48, 40), 0.37, dtype=torch.float64)
+    kept = quietly(flat, TIMING, Vibration(1.0, 50.0), prior="edges", noise=0.05)
+    assert (kept - 0.37).abs().max() < 1e-9
+    frames = torch.rand(1, 24, 20, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    quietly(frames, TIMING, Vibration(1.0, 50.0), prior="edges", noise=0.05).square().sum().backward()
+    assert torch.isfinite(frames.grad).all()
+    assert frames.grad.abs().min() > 0
+
+
+MOTION = Motion()
+SIZE = 300
+
+
+def texture(blur):
+    noise = ndimage.gaussian_filter(np.random.default_rng(1).standard_normal((SIZE, SIZE)), blur, mode="wrap")
+    return np.clip(0.5 + 0.15 * noise / noise.std(), 0, 1)
+
+
+SCENES = {
+    "buildings": partial(draw_scene, SIZE, SIZE, 14),
+    "soft": partial(draw_scene, SIZE, SIZE, 5, blur=2.5),
+    "dense texture": partial(texture, 0.7),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "rows", "noise", "given", "joint", "least", "within"),
+    [
+        ("buildings", 20, 0.02, 2, False, -0.1, 0.3),
+        ("soft", 100, 0.05, 2, True, 1.0, 0.3),
+        ("dense texture", 100, 0.001, 1, False, -0.1, 0.5),
+        ("dense texture", 20, 0.001, 2, True, -0.1, 0.3),
+    ],
+)
+def test_estimated_strength_is_close_to_the_best(name, rows, noise, given, joint, least, within):
+    timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
+    scene = SCENES[name]()
+    clean = take_frames(scene, timing, MOTION, 2)
+    frames = torch.from_numpy(clean + noise * np.random.default_rng(3).standard_normal(clean.shape)).float()[:given]
+    found = decibel(quietly(frames, timing, MOTION.vibration(), joint=joint)[0], crop(scene))
+    stack = model_of(frames, timing, MOTION.vibration())
+    by_hand = {
+        factor: decibel(solved(stack, joint=joint, regularisation=factor)[0], crop(scene))
+        for factor in (0.03, 0.1, 0.3, 1.0, 3.0)
+    }
+    assert found > max(by_hand.values()) - within
+    assert found > by_hand[1.0] + least
+    assert max(by_hand.values()) - min(by_hand.values()) > 0.5
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_power_of_pure_noise_is_close_to_zero(count):
+    noise = torch.randn(count, 1, 512, 512, generator=torch.Generator().manual_seed(0))
+    motion = frame_motion(MOTION.vibration().expanded(1), TIMING, count, 512)
+    prior = fit_prior((0.5 + 0.02 * noise)[None], motion, torch.full((1, count), 0.02), 576)
+    assert prior.power.mean() < 0.08 * 0.02**2
+    assert fit_prior((0.5 + 0.04 * noise)[None], motion, torch.full((1, count), 0.02), 576).power.mean() > 2 * 0.02**2
+
+
+@pytest.mark.parametrize(("across", "along", "joint"), [(0.2, 0.05, True), (0.02, 0.1, False)])
+def test_regular_patterns_are_restored_up_to_the_boundaries(across, along, joint):
+    rows, columns = np.mgrid[:336, :400]
+    scene = 0.5 + 0.4 * np.sin(2 * np.pi * (across * rows + along * columns))
+    motion = Motion(amplitude=(0.0, 2.0))  # all columns are visible at the ends of the rows
+    frames = torch.from_numpy(take_frames(scene, TIMING, motion, 2, 0.005)).float()
+    ends = np.r_[:16, 304:320]
+    truth = crop(scene)[32:-32][:, ends]
+
+    def quality(**options):
+        restored = quietly(frames, TIMING, motion.vibration(), joint=joint, **options)
+        return -10 * np.log10(np.mean((restored[0].numpy()[32:-32][:, ends] - truth) ** 2))
+
+    assert quality() > 41
+    assert quality(regularisation=1e4) < 35

@@ -5,7 +5,6 @@ import pytest
 import torch
 from benchmarks.independent_camera import after_optics, closed, still_image
 from finer_truth import FINER, TIMING, VIBRATION, noisy, taken
-from refusals import refuses
 from truth import decibel, draw_scene
 
 import rsvib_torch as rsv
@@ -69,17 +68,3 @@ def test_mtf_beyond_a_still_camera(scene, frames):
     assert 2 * float(plain.mtf50) == pytest.approx(float(still.mtf50), rel=0.04)
     assert 2 * float(sharp.mtf50) > 1.4 * float(still.mtf50)
     assert float(sharp.at(0.25)) > 2 * float(still.at(0.5))  # at the Nyquist frequency of the pixels
-
-
-@pytest.mark.parametrize(
-    ("optics", "options", "message"),
-    [
-        ({"sigma": -0.5}, {}, "sigma must be at least 0"),
-        ({"mtf": ([0.0, 0.1, 0.2], [0.0, 0.0, 0.0])}, {}, "optics transmit 0 at 0.1 cycles per px"),
-        ({"mtf": ([0.2, 0.1], [0.9, 0.8])}, {}, "frequencies of mtf must increase, but 0.1 follows 0.2"),
-        ({"sigma": 0.5}, {"method": "dewarp"}, "method='dewarp' has no option 'optics'"),
-        (0.5, {}, "optics must be"),
-    ],
-)
-def test_errors(frames, optics, options, message):
-    refuses(lambda: rsv.restore(frames, TIMING, VIBRATION, optics=optics, **options), message, (ValueError, TypeError))

@@ -148,14 +148,6 @@ def test_smooth_motion_continues_over_the_blanking_time(highest, known):
         assert abs(fit.row_time - row_time) < 4 * fit.std < 0.02 * row_time
 
 
-@pytest.mark.parametrize(
-    ("limits", "message"), [((6e-5, 5e-5), "the first must be smaller"), ((20.0, 60.0), "in seconds")]
-)
-def test_bad_options(two_tones, limits, message):
-    with pytest.raises(ValueError, match=message):
-        rsv.calibrate_row_time_by_motion(two_tones, frame_rate=RATE, row_time=limits)
-
-
 def test_command(two_tones, one_tone, tmp_path, capsys):
     moving, ambiguous, out = tmp_path / "moving.tif", tmp_path / "one_tone.tif", tmp_path / "sensor.toml"
     rsv.write_stack(moving, two_tones, dtype="float32")
