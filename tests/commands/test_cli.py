@@ -231,10 +231,7 @@ def test_outputs_that_cannot_be_written(place, vibration_text, tmp_path, capsys,
         (("run", frames, tmp_path / "file" / "out", *config), "file is not writable"),
         (("simulate", place / "scene.png", tmp_path / "f.webm", *config), "wmv files can only be read"),
         (("run", tmp_path / "none.tif", tmp_path / "out", *config), "none.tif does not exist"),
-        (
-            ("detect", frames, "--config", "none.toml", "--out", tmp_path / "out"),
-            "none.toml: No such",
-        ),
+        (("detect", frames, "--config", "none.toml", "--out", tmp_path / "out"), "none.toml: No such"),
     ]
 
     def refuse(*args, **kwargs):

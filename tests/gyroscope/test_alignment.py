@@ -86,18 +86,6 @@ def test_wrong_focal_length_is_corrected(frames, gyroscope):
     assert found.offset == pytest.approx(CLOCK, abs=5e-5)
 
 
-def test_columns_as_scan_axis(scene, gyroscope, tmp_path):
-    timing = rsv.SensorTiming(6e-5, 20, 300, scan_axis=-1, readout_direction="reverse")
-    frames = torch.from_numpy(take_frames(scene, TIMING, hand_shake, FRAMES, 0.005)).float().flip(-2).transpose(-2, -1)
-    clock = np.arange(811.9, 813.4, 1e-3)
-    path = log(tmp_path / "angles.csv", clock, np.degrees(angles(clock)[:, ::-1]))
-    recorded = rsv.read_motion(path, unit="deg", focal_length=FOCAL_LENGTH, signs=(-1, 1))
-    found = rsv.align_motion(frames, timing, recorded)
-    assert found.offset == pytest.approx(CLOCK, abs=5e-5)
-    assert found.drift.tolist() == pytest.approx((-DRIFT[1], DRIFT[0]), abs=0.5)
-    assert found.reliable
-
-
 def test_unrelated_recording_is_not_reliable(frames, tmp_path):
     clock = np.arange(0.0, 1.0, 1e-3)
     path = log(tmp_path / "other.csv", clock, 3 * np.stack([np.sin(170 * clock), np.cos(230 * clock**1.3)], -1))

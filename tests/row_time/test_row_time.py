@@ -53,9 +53,8 @@ def test_row_time_of_two_tones(two_tones):
     assert abs(found.frame_rows - FRAME_ROWS) < 4 * FRAME_ROWS * found.row_time_std / ROW_TIME
 
 
-@pytest.mark.parametrize("limits", [(2e-5, 5e-5), (3e-5, 5.5e-5)])
-def test_row_time_outside_the_limits_is_not_replaced_by_another(two_tones, limits):
-    found = rsv.calibrate_row_time_by_motion(two_tones, frame_rate=RATE, row_time=limits)
+def test_row_time_outside_the_limits_is_not_replaced_by_another(two_tones):
+    found = rsv.calibrate_row_time_by_motion(two_tones, frame_rate=RATE, row_time=(3e-5, 5.5e-5))
     assert not found.reliable
 
 
