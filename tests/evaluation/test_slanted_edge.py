@@ -183,17 +183,14 @@ NOISE = 0.008 * np.random.default_rng(0).standard_normal((120, 80))
         (draw_edge(5.0, 0.5, (15, 80)), "at least 16 x 16 px, got 15 x 80"),
         (draw_edge(2.5, 0.5, (18, 80)), r"crosses 0\.79 px over 18 px of length"),
         (draw_edge(5.0, 0.5, offset=(33.0, 0.0)), r"within 1\.\d px of the border of the roi, expected at least 4\.0"),
-        (draw_edge(5.0, 0.5) - draw_edge(5.0, 0.5, offset=(12.0, 0.0)), "no edge"),
         (
             np.where((np.arange(120)[:, None] > 100) & (np.arange(80) > 60), 0.4, draw_edge(5.0, 0.5)),
             r"more than one edge: [3-6]\d % of its contrast near 1\d\d px along and [67]\d px across",
         ),
         (np.clip(draw_edge(5.0, 0.5, levels=(-0.2, 1.2)), 0, 1), "dark side of the edge is clipped: 100 %"),
-        (np.clip(draw_edge(5.0, 0.5, levels=(0.1, 1.1)) + NOISE, 0, 1), "bright side .* clipped: 100 %"),
         (np.clip(draw_edge(5.0, 0.5, levels=(0.1, 1.0)) + NOISE, 0, 1), "bright side .* clipped: 5. %"),
         ((255 * draw_edge(5.0, 0.5, levels=(0.1, 1.2))).clip(0, 255).astype(np.uint8), "bright side .* exactly 255"),
         (np.where(np.arange(80) == 3, np.nan, draw_edge(5.0, 0.5)), "must be finite, got 120 pixels"),
-        (draw_edge(5.0, 0.5)[None], r"one grey image \(h, w\), got shape \(1, 120, 80\)"),
     ],
 )
 def test_bad_input(image, message):

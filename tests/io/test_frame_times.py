@@ -133,11 +133,9 @@ def test_exact_times_may_be_those_of_every_nth_frame():
     [
         (("f_0", "f_1", "f_3", "f_4"), (0, 1, 3, 4)),
         (("f_8", "f_10", "f_12", "f_20"), (0, 1, 2, 6)),  # every second frame was kept
-        (("cam2_f07", "cam2_f08", "cam2_f10", "cam2_f11"), (0, 1, 3, 4)),
         (("f_98", "f_99", "f_100", "f_101"), None),
         (("f_0", "f_33", "f_67", "f_100"), None),  # ms
         (("2024-05-01_10-00-00", "2024-05-01_10-00-01", "2024-05-02_09-00-00"), None),
-        (("dark", "flat", "scene"), None),
     ],
 )
 def test_missing_numbers_in_file_names_are_missing_frames(tmp_path, names, numbers):
