@@ -5,6 +5,8 @@ import re
 import runpy
 from pathlib import Path
 
+import cv2
+import figures
 import pytest
 from shown_output import differing_lines
 
@@ -74,6 +76,18 @@ def test_drawings_are_files_of_the_documentation(tmp_path):
     assert drawn == {path.name for path in (ROOT / "docs" / "drawings").iterdir()}
     used = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "docs").glob("*.md"))
     assert all(f"](drawings/{name})" in used for name in drawn)
+
+
+def test_figures_are_drawn_and_on_a_page(tmp_path):
+    short = ("gallery/kernels", "gallery/training_data")
+    figures.main(["--out", str(tmp_path), "--only", *short])
+    for name in short:
+        assert cv2.imread(str(tmp_path / f"{name}.png")).std() > 10
+    assert {path.stem for path in (ROOT / "docs" / "gallery").glob("*.png")} == {
+        name.removeprefix("gallery/") for name in figures.PICTURES if "/" in name
+    }
+    pages = "".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs").glob("*.md"))
+    assert all(f"]({name}.png)" in pages for name in figures.PICTURES)
 
 
 @pytest.mark.skipif(importlib.util.find_spec("mkdocstrings") is None, reason="MkDocs is not installed (extra docs)")

@@ -127,11 +127,8 @@ def test_command(frames, gyroscope, tmp_path, capsys):
     before, after = (float(value) for value in re.search(r"\n +x +([\d.]+) +([\d.]+)\n", printed).groups())
     assert before > 1.0
     assert after < 0.1 * before
-    first = rsv.read_stack(tmp_path / "out.tif")
-    assert first.shape == frames.shape
+    assert rsv.read_stack(tmp_path / "out.tif").shape == frames.shape
     assert re.search(r"restored frames agree; estimated improvement \+\d", printed)
-    assert rsvib(*arguments, *focal, "--offset", CLOCK, "--overwrite") == 0
-    assert (rsv.read_stack(tmp_path / "out.tif") - first).square().mean() < 0.01
     for name in ("out.tif", "out.tif.manifest.json"):
         (tmp_path / name).unlink()
     for more, message in (

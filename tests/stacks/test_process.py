@@ -166,14 +166,15 @@ def test_stack_without_detection_leaves_no_files(tmp_path):
 
 def test_frame_times_of_the_file_are_used_and_kept(tmp_path):
     kept = [index for index in range(FRAMES) if index not in (3, 10, 11)]  # dropped frames
-    times = write_with_gaps(tmp_path, kept)
+    start = 100.25  # s
+    times = write_with_gaps(tmp_path, kept, start)
     for name in ("out.h5", "out.tif"):
         report = process_small(tmp_path / "frames.raw", tmp_path / name)
         info = rsv.read_stack_info(tmp_path / name)
         assert info.frame_times == pytest.approx(times)
         assert info.resolution[2] == "centimeter"
     records = read_manifest(report.manifest).windows
-    assert [r.start_time for r in records] == pytest.approx([times[r.first] for r in records])
+    assert [r.start_time for r in records] == pytest.approx([times[r.first] - start for r in records])
     restored = rsv.read_stack(tmp_path / "out.tif").numpy()
     assert sorted(decibel(frame, STILL, 12) for frame in restored)[1] > 38  # also next to the gaps
     for record in records:
