@@ -159,22 +159,17 @@ def test_gradients_reach_frames_and_vibration(method):
     def loss(images, numbers):
         return (restorer(images, rsv.Vibration(*numbers)) * weights).sum()
 
+    unit = torch.eye(6, dtype=torch.float64).reshape(3, 2, 3, 2)
     images, numbers = frames.clone().requires_grad_(), values.clone().requires_grad_()
     loss(images, numbers).backward()
     direction = torch.rand(frames.shape, generator=generator, dtype=torch.float64) - 0.5
     for gradient, step, moved in (
         ((images.grad * direction).sum(), 1e-4, lambda h: loss(frames + h * direction, values)),
         *(
-            (numbers.grad[kind, axis], 1e-4, lambda h, k=kind, a=axis: loss(frames, values + h * unit(k, a)))
+            (numbers.grad[kind, axis], 1e-4, lambda h, k=kind, a=axis: loss(frames, values + h * unit[k, a]))
             for kind in range(3)
             for axis in range(2)
         ),
     ):
         numeric = (moved(step) - moved(-step)) / (2 * step)
         torch.testing.assert_close(gradient, numeric.detach(), rtol=1e-4, atol=1e-6)
-
-
-def unit(kind, axis):
-    one = torch.zeros(3, 2, dtype=torch.float64)
-    one[kind, axis] = 1.0
-    return one

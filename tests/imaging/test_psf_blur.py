@@ -79,21 +79,17 @@ def test_nodes_integrate(quadrature, exposure_rows):
         assert len(times) == math.ceil(exposure_rows)
 
 
-def fast_motion(batch=None):
-    """A motion with large differences between the rows of a small frame."""
-    amplitude = torch.tensor([[3.3], [2.4]], dtype=torch.float64)
-    if batch is not None:
-        amplitude = amplitude * torch.linspace(0.4, 1.3, batch, dtype=torch.float64)[:, None, None]
-    return Vibration(amplitude, [[2000.0], [1300.0]], [[0.4], [1.1]], [900.0, -700.0])
-
-
 SMALL = SensorTiming(row_time=20e-6, exposure_rows=6, frame_rows=64)
 
 
 def small_psf(interpolation, rows=14, batch=None):
-    starts = SMALL.row_starts(1, rows)[0]
-    starts = starts if batch is None else starts.expand(batch, -1)
-    return row_psf(fast_motion(batch), starts, SMALL, interpolation=interpolation)
+    """Of a motion with large differences between the rows of a small frame."""
+    starts, amplitude = SMALL.row_starts(1, rows)[0], torch.tensor([[3.3], [2.4]], dtype=torch.float64)
+    if batch is not None:
+        starts = starts.expand(batch, -1)
+        amplitude = amplitude * torch.linspace(0.4, 1.3, batch, dtype=torch.float64)[:, None, None]
+    motion = Vibration(amplitude, [[2000.0], [1300.0]], [[0.4], [1.1]], [900.0, -700.0])
+    return row_psf(motion, starts, SMALL, interpolation=interpolation)
 
 
 def noise(*shape, seed=0, dtype=torch.float64):
