@@ -128,6 +128,12 @@ CASES = (
         "psf_figure": (lambda: [line.get_ydata() for line in rsv.psf_figure(VIBRATION, TIMING, 96).axes[0].lines],),
         "detect_motion": (lambda frames: rsv.detect_motion(frames, TIMING), FRAMES),
         "detect_swept_tone": (lambda frames: rsv.detect_swept_tone(frames, TIMING), FRAMES),
+        "detect_swept_tone, batch": (
+            lambda frames: rsv.detect_swept_tone(
+                torch.as_tensor(frames)[None, :, None].expand(2, 4, 1, -1, -1), TIMING
+            )[1],
+            FRAMES,
+        ),
         "detect_vibration, bands": (
             lambda frames: rsv.detect_vibration(frames, TIMING, method="bands", harmonics=2),
             FRAMES,

@@ -6,6 +6,7 @@ import torch
 from truth import MARGIN, Curve, draw_scene, take_frames
 
 import rsvib_torch as rsv
+from rsvib_torch.datasets import city_and_fields
 from rsvib_torch.results.reason import Reason
 
 HEIGHT, WIDTH, FRAMES = 256, 160, 5
@@ -143,6 +144,15 @@ def test_tones_that_noise_explains_as_well_are_refused():
     found = rsv.detect_swept_tone(noise, TIMING)
     assert not found.reliable.any()
     assert "tone_of_chance" in {reason.code for of_axis in found.findings for reason in of_axis}
+
+
+def test_a_tone_that_another_one_explains_as_well_is_refused():
+    """In three frames of 96 rows, 170 Hz was found as 211 Hz; 128 Hz explains the rows as well."""
+    timing, vibration = rsv.SensorTiming(1e-4, 6, 104), rsv.Vibration([1.2, 0.8], [130.0, 170.0], [0.3, 0.9])
+    frames = rsv.simulate_frames(city_and_fields(160, 160, seed=8), timing, vibration, 3, frame_size=(96, 96))
+    found = rsv.detect_swept_tone(frames, timing)
+    assert not found.reliable.any()
+    assert "other_swept_tone" in {reason.code for reason in found.findings[1]}
 
 
 def test_long_record_is_followed_from_the_part_with_the_largest_offsets(scene):

@@ -191,6 +191,7 @@ NOISE = 0.008 * np.random.default_rng(0).standard_normal((120, 80))
         (np.clip(draw_edge(5.0, 0.5, levels=(0.1, 1.0)) + NOISE, 0, 1), "bright side .* clipped: 5. %"),
         ((255 * draw_edge(5.0, 0.5, levels=(0.1, 1.2))).clip(0, 255).astype(np.uint8), "bright side .* exactly 255"),
         (np.where(np.arange(80) == 3, np.nan, draw_edge(5.0, 0.5)), "must be finite, got 120 pixels"),
+        (draw_edge(5.0, 0.5)[None], r"one grey image \(h, w\), got shape \(1, 120, 80\)"),
     ],
 )
 def test_bad_input(image, message):

@@ -123,6 +123,7 @@ def date_of(time):
         (lambda time: {"description": f"time = {time:.6f}"}, check_no_times),  # no unit
         (lambda time: {"description": f"exposure_time_ms = {1e3 * time:.3f}"}, check_no_times),
         (lambda time: {"extratags": [(306, "s", 0, date_of(time).partition(".")[0], True)]}, check_no_times),
+        (lambda _: {"description": "<OME><Image></OME>"}, check_no_times),
         (lambda time: {"description": f"time_ms = {1e3 * time}, time_ms = 7"}, check_no_times),
     ],
 )

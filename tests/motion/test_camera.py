@@ -148,6 +148,7 @@ def test_lens_profile_for_scaled_frames(tmp_path):
         ({"digital_lens": "gopro_superview"}, "lens model 'gopro_superview' is not supported"),
         ({"distortion_model": "poly5"}, "lens model 'poly5' is not supported"),
         ({"calib_dimension": {"w": 3840, "h": 2880}}, "is for frames of 3840 x 2880 px, got 1920 x 1080 px"),
+        ({"calib_dimension": {"w": 3840}}, "not a lens profile of Gyroflow: KeyError"),
         ({"fisheye_params": {"camera_matrix": [["1", 0, 0]] * 3}}, "not a lens profile of Gyroflow: TypeError"),
         (
             {"fisheye_params": PROFILE["fisheye_params"] | {"camera_matrix": [[9.0, 0, 0], [0, 12.0, 0], [0, 0, 1]]}},
