@@ -129,9 +129,7 @@ CASES = (
         "detect_motion": (lambda frames: rsv.detect_motion(frames, TIMING), FRAMES),
         "detect_swept_tone": (lambda frames: rsv.detect_swept_tone(frames, TIMING), FRAMES),
         "detect_swept_tone, batch": (
-            lambda frames: rsv.detect_swept_tone(
-                torch.as_tensor(frames)[None, :, None].expand(2, 4, 1, -1, -1), TIMING
-            )[1],
+            lambda frames: rsv.detect_swept_tone(np.stack([frames, frames])[:, :, None], TIMING)[1],
             FRAMES,
         ),
         "detect_vibration, bands": (
