@@ -13,8 +13,8 @@ from rsvib_torch import SensorTiming
 from rsvib_torch.commands import terminal
 
 TESTS = Path(__file__).parent
-ALGORITHMS = ("detection", "registration", "restoration", "tracking", "test_imports.py")
-RENDERED = {"report", "test_presentation.py", "test_gallery.py", "test_spectrum.py"}  # tests of figures
+ALGORITHMS = ("detection", "registration", "restoration", "tracking", "test_imports.py", "test_turned_frames.py")
+RENDERED = {"report", "test_presentation.py", "test_docs.py", "test_spectrum.py"}  # tests of figures
 LONGEST = (
     "test_tutorials.py",
     "test_followed_window.py",

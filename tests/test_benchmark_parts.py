@@ -5,23 +5,10 @@ import math
 from pathlib import Path
 
 import benchmark
-import pytest
 import torch
-from benchmark import SECTIONS, module_of
 from harness import read_result, write_result
 
 import rsvib_torch as rsv
-
-
-@pytest.mark.parametrize("name", SECTIONS)
-def test_sections_have_quick_options_of_the_same_names(name):
-    try:
-        section = module_of(name)
-    except ModuleNotFoundError as error:
-        pytest.skip(str(error))
-    assert set(section.QUICK) <= set(section.OPTIONS)
-    assert callable(section.rows)
-    assert callable(section.lines)
 
 
 def test_results_are_stored_and_read_back(tmp_path):

@@ -5,6 +5,8 @@ import re
 import runpy
 from pathlib import Path
 
+import cv2
+import figures
 import pytest
 from shown_output import differing_lines
 
@@ -67,18 +69,6 @@ def test_page_on_tables_runs_and_prints_what_it_shows(tmp_path):
     assert written == {"vibration.json", "tones.csv", "offsets.csv", "offsets.png", "spectrum.csv", "spectrum.png"}
 
 
-def test_every_command_and_key_is_in_the_reference():
-    commands = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
-    for command in ("init", "simulate", "detect", "restore", "run", "report", "calibrate", "motion", "known", "live"):
-        assert f"## rsvib {command}\n" in commands
-    # rsvib init has no configuration, and rsvib calibrate has only --row-time, as the range to search
-    assert commands.count("| `--config PATH` |") == commands.count("| `--row-time TIME` |") - 2 == 8
-    assert "| `--unit px\\|rad\\|" in commands
-    keys = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
-    for row in ("`row_time` | a number | required |", "`search` | a whole number | `16` |", "`bits` |"):
-        assert f"| {row}" in keys
-
-
 def test_drawings_are_files_of_the_documentation(tmp_path):
     drawings = runpy.run_path(str(ROOT / "scripts" / "drawings.py"))
     drawings["main"](["--out", str(tmp_path)])
@@ -88,11 +78,16 @@ def test_drawings_are_files_of_the_documentation(tmp_path):
     assert all(f"](drawings/{name})" in used for name in drawn)
 
 
-@pytest.mark.skipif(importlib.util.find_spec("mkdocs") is not None, reason="MkDocs is installed")
-def test_missing_builder_is_named(docs, capsys):
-    with pytest.raises(SystemExit, match="2"):
-        docs["main"]([])
-    assert "pip install -c scripts/constraints.txt -e '.[docs]'" in capsys.readouterr().err
+def test_figures_are_drawn_and_on_a_page(tmp_path):
+    short = ("gallery/kernels", "gallery/training_data")
+    figures.main(["--out", str(tmp_path), "--only", *short])
+    for name in short:
+        assert cv2.imread(str(tmp_path / f"{name}.png")).std() > 10
+    assert {path.stem for path in (ROOT / "docs" / "gallery").glob("*.png")} == {
+        name.removeprefix("gallery/") for name in figures.PICTURES if "/" in name
+    }
+    pages = "".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs").glob("*.md"))
+    assert all(f"]({name}.png)" in pages for name in figures.PICTURES)
 
 
 @pytest.mark.skipif(importlib.util.find_spec("mkdocstrings") is None, reason="MkDocs is not installed (extra docs)")

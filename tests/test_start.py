@@ -42,10 +42,6 @@ def loaded(code, names, folder):
     return done.stderr.splitlines()[-1].split()
 
 
-def command(arguments):
-    return f"run_command({arguments.split()!r})"
-
-
 COMMANDS = (  # help, lists, and what is refused before anything is computed
     "--help",
     "known --help",
@@ -64,7 +60,11 @@ COMMANDS = (  # help, lists, and what is refused before anything is computed
         ("import rsvib_torch", ("torch", "numpy", "pydantic", "typer", "rich", *LIBRARIES)),
         ("import torch, rsvib_torch as rsv\nrsv.SensorTiming, rsv.Vibration, rsv.io, rsv.restoration", LIBRARIES),
         ("from rsvib_torch.config import read_config\nread_config('camera.toml')", PROGRAM),
-        ("from rsvib_torch.commands.main import run_command\n" + "\n".join(map(command, COMMANDS)), PROGRAM),
+        (
+            "from rsvib_torch.commands.main import run_command\n"
+            + "\n".join(f"run_command({line.split()!r})" for line in COMMANDS),
+            PROGRAM,
+        ),
     ],
 )
 def test_libraries_are_imported_when_they_are_used(tmp_path, code, names):
@@ -82,11 +82,7 @@ def test_names_of_options_are_those_of_the_tables():
     assert get_args(BadFrames) == ("pass", "skip")
 
 
-def stubs():
-    return sorted(PACKAGE.rglob("*.pyi"))
-
-
-@pytest.mark.parametrize("stub", stubs(), ids=lambda path: path.parent.name)
+@pytest.mark.parametrize("stub", sorted(PACKAGE.rglob("*.pyi")), ids=lambda path: path.parent.name)
 def test_stub_lists_what_the_package_has(stub):
     """Every name of a stub can be imported, and its list of names is that of the package."""
     tree = ast.parse(stub.read_text(encoding="utf-8"))

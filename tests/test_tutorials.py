@@ -85,20 +85,6 @@ def test_notebook(pages, notebook):
     assert "Error" not in outputs
 
 
-@pytest.mark.parametrize(
-    ("found", "number"),
-    [
-        ("x 2.11 ± 0.02 px\nreliable\n", 0),
-        ("x 2.10  ± 0.001 px\nreliable\n", 0),
-        ("x 3.1 ± 0.02 px\nreliable\n", 1),
-        ("x 2.1 ± 0.02 px\nnot reliable\n", 1),
-        ("x 2.1 ± 0.02 px\n", 1),
-    ],
-)
-def test_output_is_compared_but_for_last_digits(pages, found, number):
-    assert len(differing_lines("x 2.10 ± 0.02 px\nreliable\n", found)) == number
-
-
 def test_a_wrong_output_and_a_failing_command_are_found(pages, tmp_path):
     page = tmp_path / "page.md"
     page.write_text("```python\nprint(6 * 7)\n```\n\n```text\n99\n```\n\n```bash\nls missing  # exit code 2\n```\n")

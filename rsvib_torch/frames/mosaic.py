@@ -36,7 +36,7 @@ def colours_of(pattern: str, height: int, width: int) -> Tensor:
         >>> colours_of("RGGB", 2, 4).tolist()
         [[0, 1, 0, 1], [1, 2, 1, 2]]
     """
-    tile = torch.tensor(["RGB".index(colour) for colour in pattern]).view(2, 2)
+    tile = torch.tensor(["RGB".index(colour) for colour in pattern], device="cpu").view(2, 2)
     return tile.repeat(height // 2, width // 2)
 
 

@@ -3,6 +3,7 @@
 import gc
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import TypeVar, get_origin
 
 import numpy as np
@@ -19,6 +20,7 @@ LONG = rsv.SensorTiming(1e-4, 6, 104, frame_start_times=[0.0, 2.0])
 BANDS = {"band_rows": 16, "band_step": 8, "search": 6}
 CURVES = (torch.zeros(1), torch.zeros(1, 2), torch.zeros(1, 2))  # times, offsets, residual of a MotionCheck
 FRAMES = torch.rand(2, 96, 64, generator=torch.Generator().manual_seed(0))
+WIDE = torch.rand(2, 96, 128, generator=torch.Generator().manual_seed(0))
 VIBRATION = rsv.Vibration([1.0, 0.5], [130.0, 170.0])
 STARTS = TIMING.row_starts(1, 96)[0]
 ROLL = rsv.Vibration([1.0, 0.5, 1e-3], [130.0, 170.0, 26.0])
@@ -40,6 +42,27 @@ SWEPT = rsv.SweptTone(
 
 def blur():
     return rsv.RowVaryingBlur(rsv.row_psf(VIBRATION, STARTS, TIMING))
+
+
+def detect(frames, **options):
+    return rsv.detect_vibration(frames, TIMING, **options)
+
+
+def judge(frames, vibration=VIBRATION):
+    return rsv.judge_restoration(frames, FRAMES, TIMING, vibration)
+
+
+def in_seconds(exposure_time):
+    return rsv.SensorTiming.from_seconds(row_time=20e-6, exposure_time=exposure_time, frame_rate=30)
+
+
+def bound(scene=None, frame_size=(80, 40)):
+    scene = torch.rand(128, 96) if scene is None else scene
+    return rsv.evaluation.cramer_rao_bound(scene, TIMING, VIBRATION, noise=0.01, frame_size=frame_size)
+
+
+def sharpened(optics):
+    return rsv.restore(FRAMES, TIMING, VIBRATION, optics=optics)
 
 
 def nested():
@@ -130,6 +153,79 @@ def test_pixels_beyond_all_scales(value):
             lambda: rsv.FreeMotion.from_samples(torch.arange(11.0), torch.zeros(11, 2, requires_grad=True)),
             r"from_samples has no gradient: pass displacement\.detach\(\)",
         ),
+        (lambda: rsv.Vibration(-1.0, 50.0), "amplitude must not be negative, got -1"),
+        (lambda: rsv.Vibration(math.nan, 50.0), "amplitude must be finite"),
+        (lambda: rsv.Vibration(1.0, 50.0, image_motion=[1.0, 2.0, 3.0]), "image_motion must have shape"),
+        (lambda: rsv.Camera(0.0), "focal_length must be"),
+        (lambda: rsv.SensorTiming(2e-5, 20, 2048, readout_direction="up"), "readout_direction must be .*got 'up'"),
+        (lambda: rsv.register_bands(FRAMES, TIMING, method="sift"), "registration must be .*got 'sift'"),
+        (lambda: rsv.RollingShutterVibration(TIMING, interpolation="nearest"), "interpolation must be .*got 'nearest'"),
+        (lambda: rsv.Vibration([1.0, 2.0, 3.0, 4.0, 5.0], 50.0), r"amplitude must have shape \(2,\)"),
+        (lambda: rsv.Vibration([[1.0, 2.0], [1.0, 2.0]], [[1.0, 2.0, 3.0]] * 2), "do not fit together"),
+        (lambda: rsv.FreeMotion(torch.zeros(2, 3), 0.0, 1e-3), "N >= 4"),
+        (lambda: rsv.FreeMotion(torch.full((2, 8), torch.nan), 0.0, 1e-3), "finite"),
+        (lambda: rsv.FreeMotion(torch.zeros(2, 8), 0.0, 1e-3, rsv.Vibration.still((3,))), "batch shape"),
+        (lambda: rsv.FreeMotion.through([0.0, 1.0, 2.0, 4.0], torch.zeros(4, 2)), "evenly spaced"),
+        (lambda: rsv.FreeMotion.from_samples([0.0, 1.0, 1.0, 4.0], torch.zeros(4, 2)), "strictly increasing"),
+        (lambda: rsv.Camera(500.0, distortion=(0.1, 0.2)), "distortion must be 5 numbers"),
+        (lambda: rsv.Camera(500.0, distortion=(0.1,) * 5, fisheye=True), "distortion must be 4 numbers"),
+        (lambda: rsv.register_bands(FRAMES, TIMING, search=60), "frames of 96 x 64 px .* of 32 rows searched over 60"),
+        (lambda: rsv.register_bands(FRAMES, TIMING, band_rows=240), "too small for bands of 240 rows"),
+        (lambda: rsv.simulate_frames(STRIPES[0].byte(), TIMING, VIBRATION), "scene must be a floating-point tensor"),
+        (
+            lambda: rsv.simulate_frames(torch.zeros(600, 99), TIMING, VIBRATION, frame_size=(400, 50)),
+            "frame_rows=104 is",
+        ),
+        (lambda: rsv.simulate_frames(STRIPES[0], TIMING, rsv.Vibration.still((2,))), "vibration is a batch of shape"),
+        (lambda: bound(frame_size=(400, 40)), "too small"),
+        (lambda: bound(torch.zeros(128, 96, dtype=torch.uint8)), "floating-point"),
+        (lambda: sharpened({"mtf": ([0.0, 0.1, 0.2], [0.0, 0.0, 0.0])}), "optics transmit 0 at 0.1 cycles per px"),
+        (lambda: sharpened({"mtf": ([0.2, 0.1], [0.9, 0.8])}), "frequencies of mtf must increase, but 0.1 follows 0.2"),
+        (lambda: sharpened(0.5), "optics must be"),
+        (lambda: rsv.psnr(FRAMES, FRAMES[..., 1:], 1.0), r"\(2, 96, 63\)"),
+        (lambda: rsv.ssim(FRAMES[:1], FRAMES, 1.0), "more images"),
+        (lambda: rsv.ssim(FRAMES[0, 0], FRAMES[0, 0], 1.0), r"\(64,\)"),
+        (lambda: rsv.psnr(FRAMES, FRAMES, 1.0, rim=32), "rim=32"),
+        (lambda: rsv.SensorTiming(0.02052, 20, 2048), "row_time=0.02052 s is longer than 10 ms; row_time is in s"),
+        (lambda: rsv.SensorTiming(5e-3, 20, 2048), "frame period of 10.24 s, longer than 10 s"),
+        (lambda: rsv.SensorTiming("20us", 20, 2048), "row_time must be a number, got '20us'"),
+        (lambda: rsv.SensorTiming(2e-5, 2049, 2048), "exposure_rows=2049 exceeds the frame period"),
+        (lambda: rsv.SensorTiming(2e-5, 20, 2048, frame_start_times=[0.0, 0.2, 0.1]), "must be strictly increasing"),
+        (lambda: TIMING.check_rows(105), "frame_rows=104 is less than the 105 rows of the frames"),
+        (lambda: rsv.SensorTiming(20e-6, 0.002, 1700), r"exposure_rows=0.002 .* \(0.002 s are exposure_rows=100\)"),
+        (lambda: in_seconds(0.0), "exposure_time must be larger than 0"),
+        (lambda: in_seconds(410.0), "exposure 410 s, .*; 410 us is 410us"),
+        (lambda: rsv.SensorTiming.line_sensors(1e-4, [0.0], 900), r"delays must have at least two entries, got \[0"),
+        (lambda: detect(FRAMES.byte(), full_scale=0), "full_scale must be larger than 0"),
+        (lambda: detect(FRAMES[:1]), "at least 2 frames are needed, got 1"),
+        (lambda: detect(torch.full((2, 96, 128), 0.4)), "frame 0 is constant"),
+        (lambda: detect(WIDE * torch.tensor([1.0, 0.0])[:, None, None]), "frame 1 is constant"),
+        (lambda: detect(torch.stack([WIDE, 0 * WIDE])[:, :, None]), "frame 0 of stack 1 is"),
+        (lambda: detect(WIDE[:, :24], method="bands"), "too small for bands of 32 rows searched over 16 px"),
+        (lambda: detect(WIDE, roll=True), "frames of 96 x 128 px .* in 2 parts .* at least 64 x 192 are needed"),
+        (lambda: detect(torch.rand(2, 24, 640)), "frames of 24 x 640 px .* at least 64 x 96 are needed"),
+        (lambda: detect(torch.rand(2, 64, 90)), "frames of 64 x 90 px .* at least 64 x 96 are needed"),
+        (lambda: detect(WIDE, columns=64, roll=True), "columns=64 goes with roll=False"),
+        (lambda: detect(WIDE, roll=False, zoom=True), "zoom=True measures roll as well"),
+        (lambda: detect(WIDE, principal_point=(1.0, 2.0)), "principal_point=.* requires focal_length"),
+        (lambda: detect(WIDE, distortion=(0.1, 0.0, 0.0, 0.0, 0.0)), "distortion=.* requires focal_length"),
+        (lambda: detect(WIDE, focal_length=300.0, distortion=(-3.0, 0.0, 0.0, 0.0, 0.0)), "not invertible in frames"),
+        (
+            lambda: rsv.calibrate_row_time_by_motion(FRAMES, frame_rate=90.0, row_time=(6e-5, 5e-5)),
+            "the first must be smaller",
+        ),
+        (lambda: rsv.calibrate_row_time_by_motion(FRAMES, frame_rate=90.0, row_time=(20.0, 60.0)), "in seconds"),
+        (lambda: rsv.restore(FRAMES, TIMING, SimpleNamespace(motion=None)), "of other results, pass .motion"),
+        (lambda: rsv.restore(FRAMES, TIMING, VIBRATION, ignore=FRAMES[..., 1:] > 0), "ignore must be a boolean mask"),
+        (lambda: rsv.restore(FRAMES, TIMING, VIBRATION, ignore=FRAMES >= 0), "no pixel with data"),
+        (lambda: rsv.restore(FRAMES, TIMING, rsv.Vibration.still((3,))), r"vibration of batch shape \(3,\) does"),
+        (lambda: rsv.restore(FRAMES, TIMING, rsv.Vibration(1.0, 5e7)), "periods while a row is exposed"),
+        (lambda: judge(FRAMES[:1]), "at least 2 frames are needed, got 1"),
+        (lambda: judge(FRAMES[:, :16]), r"restored must have the shape \(2, 16, 64\)"),
+        (lambda: judge(FRAMES[None, :, None]), "frames must be one stack"),
+        (lambda: judge(FRAMES, rsv.Vibration(1.0, 50.0, image_motion=(9e3, 0.0))), "nothing in common"),
+        (lambda: judge(FRAMES, VIBRATION.expanded(2)), "does not fit frames of shape"),
+        (lambda: judge(FRAMES * torch.nan), "no pixel with data"),
         *(
             (lambda motions=motions: rsv.FreeMotion.stacked(motions), r"motions(\[0\])? must be an instance of")
             for motions in (torch.tensor(1.0), torch.zeros(0), np.zeros(3))

@@ -84,7 +84,6 @@ def test_table_has_no_row_that_contradicts_itself():
         ("iPhone 12", (1920, 1080, 24), "several modes fit.*: Apple iPhone 12 Ultra Wide, Apple iPhone 12 Wide"),
         ("iPhone 12", (1920, 1080, 60), "no mode .* 1920 x 1080 px at 60/s: 3840 x 2160 px at 60/s, "),  # half the size
         ("iPhone 12", (3840, 2160, 30), "no mode of Apple iPhone 12"),  # another rate
-        ("iPhone 12", (3840, 2880, 60), "no mode of Apple iPhone 12"),  # another aspect
     ],
 )
 def test_what_the_table_does_not_state_is_refused(name, size, message):

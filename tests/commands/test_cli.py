@@ -66,35 +66,23 @@ def restore_arguments(place, folder, out="r.tif"):
 
 
 def test_pixels_without_data_are_neither_used_nor_changed(tmp_path, capsys):
-    timing = SensorTiming(row_time=4e-5, exposure_rows=12, frame_rows=210)
+    timing, motion = SensorTiming(row_time=4e-5, exposure_rows=12, frame_rows=210), Motion(AMPLITUDE, FREQUENCY, PHASE)
     scene = draw_scene(200 + 2 * MARGIN, 160 + 2 * MARGIN, 3)
-    motion = Motion(AMPLITUDE, FREQUENCY, PHASE)
     frames = np.clip(4095 * take_frames(scene, timing, motion, 5, 0.003), 1, 4095).astype(np.uint16)
     border = np.arange(160) < 50 - 0.2 * np.arange(200)[:, None]
     frames[:, border] = 65535
     tags = [(42113, "s", 0, "65535", False)]
     tifffile.imwrite(tmp_path / "f.tif", frames, photometric="minisblack", metadata=None, extratags=tags)
-    text = "[sensor]\nrow_time = 4e-5\nexposure_rows = 12\nframe_rows = 210\nfull_scale = 4095\n"
-    (tmp_path / "camera.toml").write_text(text)
-    config = ("--config", tmp_path / "camera.toml")
-    sharp = crop(scene)[24:-24, 24:-24]
-
-    def check(path):
-        restored = tifffile.imread(path)
+    camera = ("--row-time", "40us", "--exposure", "0.48ms", "--frame-rate", timing.frame_rate, "--full-scale", 4095)
+    inside, sharp = ~border[24:-24, 24:-24], crop(scene)[24:-24, 24:-24]
+    for name, more in (("whole", ()), ("windows", ("--window", 3))):
+        assert rsvib("run", tmp_path / "f.tif", tmp_path / name, *camera, *more) == 0
+        restored = tifffile.imread(tmp_path / name / "restored.tif")
         assert (restored[:, border] == 65535).all()
         assert (restored[:, ~border] <= 4095).all()
-        inside = ~border[24:-24, 24:-24]
         before, after = (f[:, 24:-24, 24:-24][:, inside] / 4095 - sharp[inside] for f in (frames, restored))
         assert np.square(after).mean() < np.square(before).mean() / 100  # 20 dB
-
-    assert rsvib("run", tmp_path / "f.tif", tmp_path / "whole", *config) == 0
-    assert rsvib("run", tmp_path / "f.tif", tmp_path / "windows", *config, "--window", "3") == 0
-    for name in ("whole", "windows"):
-        check(tmp_path / name / "restored.tif")
     assert "not kept" not in capsys.readouterr().out
-    found = ("--vibration", tmp_path / "whole" / "vibration.json", "--joint", "all")
-    assert rsvib("restore", tmp_path / "f.tif", tmp_path / "r.tif", *config, *found) == 0
-    assert (tifffile.imread(tmp_path / "r.tif") == 65535)[..., border].all()
     vibration = json.loads((tmp_path / "whole" / "vibration.json").read_text())["vibration"]
     assert [tones[0] for tones in vibration["amplitude"]] == pytest.approx(AMPLITUDE, rel=0.01)
 
@@ -174,6 +162,7 @@ def test_options_of_restoration_come_from_config_or_command_line(place, tmp_path
     assert decibel(read_stack(out / "restored.tif")[0], at_rest.numpy()) > 40
     for options, message in (
         (("--method", "dewarp", "--joint", "2"), "--joint is no option of method='dewarp'; its options are chunk_rows"),
+        (("--method", "exact", "--optics-sigma", -1), "--optics-sigma must be at least 0, got -1"),
         (("--method", "exact", "--joint", "many"), "--joint must be 'all' or a number of frames, got 'many'"),
     ):
         assert message in refused(capsys, *common, *options)
@@ -199,59 +188,26 @@ def test_full_scale_comes_from_option_file_or_config(place, tmp_path, capsys):
     assert not (tmp_path / "out2").exists()
 
 
-def test_options_describe_the_camera_without_a_file(place, tmp_path):
-    camera = ("--row-time", "40us", "--exposure", "0.48ms", "--frame-rate", 1 / (512 * 4e-5))
-    assert rsvib("detect", place / "frames.tif", *camera, "--out", tmp_path / "options") == 0
-    found = json.loads((tmp_path / "options" / "vibration.json").read_text())
-    assert [tones[0] for tones in found["vibration"]["amplitude"]] == pytest.approx(AMPLITUDE, rel=0.02)
+def test_options_describe_the_camera_without_a_file(place, tmp_path, capsys):
+    """The frame rate is that of the file; it and the full scale are in the next command."""
+    camera, found = ("--row-time", "40us", "--exposure", "0.48ms"), tmp_path / "found"
+    assert rsvib("detect", place / "frames.tif", *camera, "--full-scale", 65535, "--out", found) == 0
+    printed = capsys.readouterr()
+    assert "frame rate 48.8281 per second, from the times in" in re.sub(r"\s+", " ", printed.out + printed.err)
+    assert "--full-scale 65535" in printed.out
+    stated = json.loads((found / "vibration.json").read_text())
+    assert stated["timing"]["frame_rows"] == pytest.approx(512)
+    assert [tones[0] for tones in stated["vibration"]["amplitude"]] == pytest.approx(AMPLITUDE, rel=0.02)
+    np.save(tmp_path / "frames.npy", np.zeros((2, 96, 96), np.uint8))
+    assert "the camera is not described: give --frame-rate, or --config" in refused(
+        capsys, "detect", tmp_path / "frames.npy", *camera, "--out", tmp_path / "none"
+    )
     wrong = tmp_path / "wrong.toml"
     wrong.write_text(CONFIG.replace("4e-5", "5e-5").replace("exposure_rows = 12", "exposure_time = 0.48e-3"))
     arguments = (place / "frames.tif", "--config", wrong, "--row-time", "40us", "--out", tmp_path / "replaced")
     assert rsvib("detect", *arguments) == 0
     replaced = json.loads((tmp_path / "replaced" / "vibration.json").read_text())
-    assert replaced["vibration"]["frequency"][0] == pytest.approx(found["vibration"]["frequency"][0], rel=1e-3)
-
-
-def test_the_frame_rate_of_the_file_and_the_full_scale_are_in_the_next_command(place, tmp_path, capsys):
-    camera = ("--row-time", "40us", "--exposure", "0.48ms")
-    assert rsvib("detect", place / "frames.tif", *camera, "--full-scale", 65535, "--out", tmp_path / "found") == 0
-    printed = capsys.readouterr()
-    found = json.loads((tmp_path / "found" / "vibration.json").read_text())
-    assert found["timing"]["frame_rows"] == pytest.approx(512)
-    assert [tones[0] for tones in found["vibration"]["amplitude"]] == pytest.approx(AMPLITUDE, rel=0.02)
-    assert "frame rate 48.8281 per second, from the times in" in re.sub(r"\s+", " ", printed.out + printed.err)
-    assert "--full-scale 65535" in printed.out
-    np.save(tmp_path / "frames.npy", np.zeros((2, 96, 96), np.uint8))
-    assert "the camera is not described: give --frame-rate, or --config" in refused(
-        capsys, "detect", tmp_path / "frames.npy", *camera, "--out", tmp_path / "none"
-    )
-
-
-@pytest.fixture(scope="module")
-def bad_inputs(place):
-    """Frames and configurations that are refused, in the folder of the others."""
-    write_stack(place / "one.npy", read_stack(place / "frames.tif")[:1])
-    (place / "cut.tif").write_bytes((place / "frames.tif").read_bytes()[:100_000])
-    (place / "wrong.toml").write_text(CONFIG.replace("search = 8", "search = 1"))
-    return place
-
-
-@pytest.mark.parametrize(
-    ("command", "frames", "config", "message"),
-    [
-        ("detect", "one.npy", "camera.toml", "at least 2 frames are needed, got 1"),
-        ("run", "cut.tif", "camera.toml", "cut.tif: not a readable TIFF stack: "),
-        ("run", "none.tif", "camera.toml", "none.tif does not exist"),
-        ("detect", "frames.tif", "none.toml", "none.toml: No such file or directory"),
-        ("detect", "frames.tif", "wrong.toml", "detection.search must be at least 2, got 1"),
-    ],
-)
-def test_errors_of_bad_input_are_one_line_and_leave_no_files(
-    bad_inputs, tmp_path, capfd, frames, config, message, command
-):
-    target = (tmp_path / "out",) if command == "run" else ("--out", tmp_path / "out")
-    assert message in refused(capfd, command, bad_inputs / frames, *target, "--config", bad_inputs / config)
-    assert list(tmp_path.iterdir()) == []
+    assert replaced["vibration"]["frequency"][0] == pytest.approx(stated["vibration"]["frequency"][0], rel=1e-3)
 
 
 def test_outputs_that_cannot_be_written(place, vibration_text, tmp_path, capsys, monkeypatch):
@@ -265,6 +221,8 @@ def test_outputs_that_cannot_be_written(place, vibration_text, tmp_path, capsys,
         (("detect", frames, *config, "--out", tmp_path / "file"), "a file of that name exists"),
         (("run", frames, tmp_path / "file" / "out", *config), "file is not writable"),
         (("simulate", place / "scene.png", tmp_path / "f.webm", *config), "wmv files can only be read"),
+        (("run", tmp_path / "none.tif", tmp_path / "out", *config), "none.tif does not exist"),
+        (("detect", frames, "--config", "none.toml", "--out", tmp_path / "out"), "none.toml: No such"),
     ]
 
     def refuse(*args, **kwargs):
@@ -298,6 +256,7 @@ def test_usage_errors(capsys, tmp_path):
         (("paint",), "No such command 'paint'"),
         (("run", "a.png", "b.png", "out"), "(out); give a sequence of files as their folder"),
         ((*detect, "--config", "c.toml", "--full-scale", "x"), "Invalid value for '--full-scale'"),
+        (("restore", "f.tif", "r.tif", "--vibration", "v", "--mosaic", "RGB"), "'RGB' is not one of 'RGGB', 'BGGR'"),
     ):
         assert message in refused(capsys, *arguments)
     assert rsvib() == 0

@@ -7,13 +7,26 @@ import numpy as np
 import pytest
 import tifffile
 from program import refused, rsvib
-from small_stack import CAMERA, HEIGHT, WIDTH, write_small
+from small_stack import CAMERA, HEIGHT, STILL, WIDTH, write_small
 
-from rsvib_torch import read_stack_info, write_stack
+from rsvib_torch import read_stack, read_stack_info, write_stack
 from rsvib_torch.datasets import example_frames
 
 FRAMES = 13
 CONFIG = CAMERA + "[stack]\nwindow = 4\n"
+MOSAIC = """
+[restoration]
+joint = true
+scale = 2
+mosaic = "RGGB"
+
+[restoration.optics]
+sigma = 0.4
+pixel = 1.0
+
+[stack]
+window = 3
+"""
 
 
 @pytest.fixture(scope="module", name="place")
@@ -150,3 +163,17 @@ def test_readout_time_replaces_the_row_time(tmp_path, capsys):
     assert stored["row_time"] == pytest.approx(timing.row_time)
     message = "--readout-time replaces --row-time of frames in a file, and goes without --config"
     assert message in refused(capsys, *detect, "--row-time", "100us", "--overwrite")
+
+
+def test_raw_frames_behind_colour_filters_on_a_finer_grid(tmp_path):
+    """With keys of the configuration in windows, and as a report with options of the command."""
+    raw, out, config = tmp_path / "raw.tif", tmp_path / "out", tmp_path / "mosaic.toml"
+    write_small(raw, frames=5)  # of a grey scene
+    config.write_text(CAMERA.partition("[restoration]")[0] + MOSAIC)
+    assert rsvib("run", raw, out, "--config", config, "--workers", 1) == 0
+    assert read_stack_info(out / "restored.tif").shape == (2, 3, 2 * HEIGHT, 2 * WIDTH)
+    written = read_stack(out / "restored.tif")[0, :, ::2, ::2].double().numpy()
+    assert np.sqrt(np.mean((written - STILL)[:, 12:-12, 12:-12] ** 2)) < 0.06
+    assert (out / "before_after.png").exists()
+    assert rsvib("report", raw, tmp_path / "page", "--config", config) == 0
+    assert "2 x 2 points per px, the input is interpolated" in (tmp_path / "page" / "report.html").read_text()

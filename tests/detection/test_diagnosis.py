@@ -1,11 +1,12 @@
-"""A timing that the frames contradict: the reasons name the setting that is wrong, with the value that agrees."""
+"""Reasons that name what is wrong: the timing with the value that agrees, the exposure, and halves that move apart."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from truth import Motion, recorded
+from truth import Curve, Motion, recorded
 
 from rsvib_torch import SensorTiming, detect_vibration
 
@@ -14,16 +15,15 @@ TIMING = SensorTiming(row_time=1 / (RATE * 230), exposure_rows=8, frame_rows=230
 MOTION = Motion((1.4, 1.1), (53.0, 65.0), (0.4, 1.3))
 
 
-class Walk(Motion):
+@Curve
+def walk(times):
     """Sums of 60 tones below 40 Hz, which no four tones explain."""
-
-    def displacement(self, times):
-        generator = np.random.default_rng(5)
-        frequency = generator.uniform(2.0, 40.0, (2, 60))
-        amplitude = generator.standard_normal((2, 60)) / frequency
-        phase = generator.uniform(-3.0, 3.0, (2, 60))
-        waves = amplitude * np.sin(2 * np.pi * frequency * times[:, None, None] + phase)
-        return 1.5 * waves.sum(-1) / np.linalg.norm(amplitude, axis=-1)
+    generator = np.random.default_rng(5)
+    frequency = generator.uniform(2.0, 40.0, (2, 60))
+    amplitude = generator.standard_normal((2, 60)) / frequency
+    phase = generator.uniform(-3.0, 3.0, (2, 60))
+    waves = amplitude * np.sin(2 * np.pi * frequency * times[:, None, None] + phase)
+    return 1.5 * waves.sum(-1) / np.linalg.norm(amplitude, axis=-1)
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +89,7 @@ def test_a_wrong_readout_is_named(frames, wrong, code, agreeing):
 
 
 def test_a_motion_that_is_no_sum_of_tones_names_no_timing():
-    found = detect_vibration(recorded((HEIGHT, WIDTH), TIMING, Walk(), 4, 0.005, seed=8), TIMING)
+    found = detect_vibration(recorded((HEIGHT, WIDTH), TIMING, walk, 4, 0.005, seed=8), TIMING)
     codes = {reason.code for of_axis in found.findings for reason in of_axis}
     assert codes & {"rows_unexplained", "neighbours_unexplained", "too_many_tones"}
     assert causes(found) == []
@@ -101,3 +101,67 @@ def test_a_batch_names_the_cause_of_its_own_stack(frames):
     assert found.reliable.tolist()[0] == [True, True]
     assert causes(found[0]) == []
     assert [cause.code for cause in causes(found[1])] == ["other_readout_direction"]
+
+
+BLURRED_SIZE = 192, 160
+BLURRED_TIMING = SensorTiming(row_time=1e-4, exposure_rows=30, frame_rows=300)
+LARGE_MOTION = Motion((4.0, 3.0), (47.0, 61.0), (0.4, 1.3))
+ALL = {"blur_contradicts_exposure"}
+
+
+def codes(found):
+    return [{reason.code for reason in of_axis} for of_axis in found.findings]
+
+
+@pytest.fixture(scope="module")
+def blurred():
+    return recorded(BLURRED_SIZE, BLURRED_TIMING, LARGE_MOTION, 8, 0.004, seed=3)
+
+
+@pytest.mark.parametrize(("stated", "expected"), [(30.0, set()), (27.0, set()), (15.0, ALL), (0.1, ALL), (50.0, ALL)])
+def test_an_exposure_is_refused_that_the_blur_contradicts(blurred, stated, expected):
+    """Stated far too short, the amplitude of 61 Hz is 5 % too small, with a standard deviation of 0.1 %."""
+    found = detect_vibration(blurred, replace(BLURRED_TIMING, exposure_rows=stated))
+    assert codes(found) == [expected, expected]
+
+
+def test_the_exposures_that_the_blur_agrees_with_are_stated(blurred):
+    found = detect_vibration(blurred, BLURRED_TIMING)
+    (text,) = (text for text in found.assumptions if "the blur agrees with" in text)
+    low, high = map(float, re.search(r"agrees with ([\d.]+) to ([\d.]+):", text).groups())
+    assert 15 < low < 30 < high < 45
+    x = np.sinc(47.0 * 30e-4) / np.sinc(47.0 * np.array([low, high]) * 1e-4) - 1
+    shown = re.search(r"x 47 Hz: amplitude (\S+) to (\S+) %", text).groups()
+    np.testing.assert_allclose([float(value) / 100 for value in shown], x, rtol=0.1)
+
+
+def beside(motions, num_frames):
+    """Frames whose halves show scenes that move by motions of their own."""
+    return torch.cat(
+        [recorded(BLURRED_SIZE, BLURRED_TIMING, one, num_frames, 0.004, seed=n) for n, one in enumerate(motions)], -1
+    )
+
+
+def test_parallax_does_not_refuse_halves_that_vibrate_alike():
+    """The right half travels by 0.15 px per frame."""
+    moving = replace(LARGE_MOTION, image_motion=(4.0, -3.0))
+    found = detect_vibration(beside([LARGE_MOTION, moving], 4), BLURRED_TIMING)
+    assert codes(found) == [set(), set()]
+    error = found.vibration.amplitude[:, 0].numpy() - LARGE_MOTION.amplitude
+    assert (np.abs(error) < 4 * found.std.amplitude[:, 0].numpy()).all()
+    # two frames cannot tell parallax from a uniform roll
+    assert "halves_apart" in set.union(*codes(detect_vibration(beside([LARGE_MOTION, moving], 2), BLURRED_TIMING)))
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_halves_that_vibrate_differently_are_refused(axis):
+    """By 0.1 px, as zoom (along x) and roll (along y) do."""
+    size = np.eye(2)[axis] * 0.05
+
+    def half(sign):
+        return Curve(
+            lambda times: LARGE_MOTION.displacement(times) + sign * size * np.sin(2 * np.pi * 55.0 * times)[:, None]
+        )
+
+    found = detect_vibration(beside([half(-1), half(1)], 4), BLURRED_TIMING, roll=False, zoom=False)
+    assert "halves_apart" in set.union(*codes(found))

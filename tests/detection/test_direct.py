@@ -161,19 +161,6 @@ def test_amplitude_of_a_blind_tone_caused_by_blur_does_not_diverge():
     assert found.vibration.frequency[:, 0].tolist() == pytest.approx([50.0, 30.0], rel=0.001)
 
 
-def test_two_tones_over_four_frames_are_detected(paper_camera):
-    first = Motion((1.5, 1.2), (41.0, 97.0), (0.7, 0.3))
-    second = Motion((0.6, 0.4), (180.0, 66.0), (2.1, -2.0))
-    both = Curve(lambda times: first.displacement(times) + second.displacement(times))
-    frames = recorded((2048, 384), paper_camera, both, 4, 0.005, seed=43)
-    found = detect_vibration(frames, paper_camera, method="direct").vibration
-    assert found.amplitude.shape == (2, 2)
-    for k, motion in enumerate((first, second)):
-        truth = motion.vibration()
-        assert (found.frequency[:, k] / truth.frequency[:, 0] - 1).abs().max() < 2e-4
-        assert (found.amplitude[:, k] / truth.amplitude[:, 0] - 1).abs().max() < 5e-3
-
-
 def test_standard_deviations_of_groups_of_unequal_size():
     """Ten frames make groups of five and six: the frame that the smaller group lacks is not an error."""
     camera = SensorTiming(row_time=163e-6, exposure_rows=3, frame_rows=256)

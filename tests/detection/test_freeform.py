@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from motion_truth import common_warp, offset_error, rms
-from truth import MARGIN, Curve, Motion, draw_scene, recorded, take_frames
+from truth import MARGIN, Curve, draw_scene, recorded, take_frames
 
 import rsvib_torch as rsv
 
@@ -13,14 +13,13 @@ TIMING = rsv.SensorTiming(row_time=6e-5, exposure_rows=20, frame_rows=270)
 SPAN = FRAMES * TIMING.frame_period
 
 
-class Jitter(Motion):
+@Curve
+def jitter(times):
     """A settling step along x, a chirp with drift along y: not a sum of sinusoids."""
-
-    def displacement(self, times):
-        place = times / SPAN
-        x = 4 * np.exp(-3 * place) * np.sin(2 * np.pi * 6.1 * place**0.9 + 0.3) + 3 * np.tanh(8 * (place - 0.6))
-        y = 12 * place - 9 * place**2 + 1.5 * np.sin(2 * np.pi * (2 * place + 2.2 * place**2))
-        return np.stack([x, y], axis=-1)
+    place = times / SPAN
+    x = 4 * np.exp(-3 * place) * np.sin(2 * np.pi * 6.1 * place**0.9 + 0.3) + 3 * np.tanh(8 * (place - 0.6))
+    y = 12 * place - 9 * place**2 + 1.5 * np.sin(2 * np.pi * (2 * place + 2.2 * place**2))
+    return np.stack([x, y], axis=-1)
 
 
 def without_frame_mean(values):
@@ -35,7 +34,7 @@ def make_scene():
 
 @pytest.fixture(scope="module", name="frames")
 def make_frames(scene):
-    return torch.from_numpy(take_frames(scene, TIMING, Jitter(), FRAMES, 0.005)).float()
+    return torch.from_numpy(take_frames(scene, TIMING, jitter, FRAMES, 0.005)).float()
 
 
 @pytest.fixture(scope="module", name="found")
@@ -44,8 +43,8 @@ def make_found(frames):
 
 
 def test_observable_displacement_is_measured(found):
-    error = found.displacement.numpy() - Jitter().displacement(found.times.numpy())
-    assert (rms(without_frame_mean(Jitter().displacement(found.times.numpy()))) > 1.0).all()
+    error = found.displacement.numpy() - jitter.displacement(found.times.numpy())
+    assert (rms(without_frame_mean(jitter.displacement(found.times.numpy()))) > 1.0).all()
     assert (rms(without_frame_mean(error)) < 0.05).all()
     assert (rms(error - error.mean((0, 1))) < 0.4).all()
     assert found.reliable.all()
@@ -53,7 +52,7 @@ def test_observable_displacement_is_measured(found):
 
 
 def test_standard_deviations_agree_with_errors(found):
-    error = found.displacement.numpy() - Jitter().displacement(found.times.numpy())
+    error = found.displacement.numpy() - jitter.displacement(found.times.numpy())
     assert (rms(without_frame_mean(error)) < 2.5 * found.std_seen.numpy()).all()
     assert (found.std_seen.numpy() < 0.1).all()
     assert (rms(error - error.mean((0, 1))) < 2.5 * rms(found.std.numpy())).all()
@@ -75,15 +74,6 @@ def test_standard_deviations_near_a_sudden_step(scene):
     assert (rms(without_frame_mean(error)) < 2.5 * found.std_seen.numpy()).all()
 
 
-def test_colour_and_scan_along_columns(frames, found):
-    timing = rsv.SensorTiming(TIMING.row_time, 20, TIMING.frame_rows, scan_axis=-1, readout_direction="reverse")
-    turned = frames.flip(-2).transpose(-2, -1)
-    other = rsv.detect_motion(turned[:, None].expand(-1, 3, -1, -1), timing)
-    expected = found.displacement.flip(-1) * torch.tensor([-1.0, 1.0])
-    assert (other.displacement - expected).abs().amax() < 1e-3
-    assert torch.allclose(other.std, found.std.flip(-1), rtol=1e-3)
-
-
 def test_image_motion_is_separated():
     scan = Curve(lambda t: np.stack([1.5 * np.sin(2 * np.pi * 5.3 * t / SPAN), -500.0 * (t - 0.5 * SPAN)], axis=-1))
     frames = recorded((HEIGHT, WIDTH), TIMING, scan, FRAMES, 0.005, seed=6, margin=MARGIN + 80)
@@ -93,21 +83,16 @@ def test_image_motion_is_separated():
     assert (rms(without_frame_mean(error - error.mean((0, 1)))) < 0.1).all()
 
 
-@pytest.fixture(scope="module", name="first_found")
-def make_first_found(frames):
-    return rsv.detect_motion(frames[:3], TIMING)
-
-
-def test_missing_pixels_do_not_change_the_result(frames, first_found):
+def test_missing_pixels_do_not_change_the_result(frames):
     """Bright spots of dirt on the sensor do not move with the scene."""
     hole = np.zeros((HEIGHT, WIDTH), dtype=bool)
     for top, left in np.random.default_rng(1).integers(0, (HEIGHT - 12, WIDTH - 12), (40, 2)):
         hole[top : top + 12, left : left + 12] = True
     assert 0.08 < hole.mean() < 0.3
     dirty = torch.where(torch.from_numpy(hole), 0.9 + 0.1 * torch.rand(HEIGHT, WIDTH), frames[:3])
-    truth = Jitter().displacement(first_found.times.numpy())
 
     def error(result):
+        truth = jitter.displacement(result.times.numpy())
         return rms(without_frame_mean(result.displacement.numpy() - truth)).max()
 
     masked = rsv.detect_motion(dirty, TIMING, ignore=hole)
@@ -115,20 +100,6 @@ def test_missing_pixels_do_not_change_the_result(frames, first_found):
     assert error(rsv.detect_motion(dirty, TIMING)) > 3 * error(masked)
     holes = rsv.detect_motion(dirty.masked_fill(torch.from_numpy(hole), torch.nan), TIMING)
     assert torch.equal(holes.displacement, masked.displacement)
-
-
-def test_batches_and_arrays_equal_single_tensors(frames, first_found):
-    other = frames[:3].flip(-1).contiguous()
-    both = rsv.detect_motion(torch.stack([frames[:3], other])[:, :, None].numpy(), TIMING)
-    for index, single in enumerate((first_found, rsv.detect_motion(other, TIMING))):
-        one = both[index]
-        for name in ("times", "displacement", "std", "std_seen", "unseen", "unexplained", "reliable"):
-            assert torch.equal(getattr(one, name), getattr(single, name)), name
-        times = single.times + 1e-3
-        assert torch.equal(one.motion.displacement(times), single.motion.displacement(times))
-        assert one.findings == single.findings
-    assert torch.allclose(both.displacement[1, ..., 0], -first_found.displacement[..., 0], atol=0.05)
-    assert both.motion.displacement(both.times[None]).shape == (2, 3, 32, 2)
 
 
 def test_motion_beyond_the_search_range_is_reported(scene):
@@ -145,22 +116,21 @@ def test_motion_beyond_the_search_range_is_reported(scene):
     assert all(of_axis[0].code == "rows_not_registered" for of_axis in bands.findings)
 
 
-class Ringing(Motion):
+@Curve
+def ringing(times):
     """Two tones and a drift along the scan axis, as on a spacecraft; one tone has the frame rate."""
-
-    def displacement(self, times):
-        turns = times / TIMING.frame_period
-        x = 3.0 * np.sin(2 * np.pi * 0.61 * turns + 0.4) + 1.2 * np.sin(2 * np.pi * turns + 1.0) + 0.08 * turns**2
-        y = 2.0 * np.sin(2 * np.pi * 0.83 * turns + 2.0) + 1.6 * np.cos(2 * np.pi * 0.26 * turns) + 3.0 * turns
-        return np.stack([x, y], axis=-1)
+    turns = times / TIMING.frame_period
+    x = 3.0 * np.sin(2 * np.pi * 0.61 * turns + 0.4) + 1.2 * np.sin(2 * np.pi * turns + 1.0) + 0.08 * turns**2
+    y = 2.0 * np.sin(2 * np.pi * 0.83 * turns + 2.0) + 1.6 * np.cos(2 * np.pi * 0.26 * turns) + 3.0 * turns
+    return np.stack([x, y], axis=-1)
 
 
 def test_offsets_of_all_pairs_are_measured_despite_an_unobservable_tone():
     """A tone at the frame rate is equivalent to a warp of the scene: it is not observable and affects nothing else."""
-    frames = recorded((HEIGHT, 112), TIMING, Ringing(), 8, 0.005, seed=12)
+    frames = recorded((HEIGHT, 112), TIMING, ringing, 8, 0.005, seed=12)
     found = rsv.detect_motion(frames, TIMING)
     times = (TIMING.row_starts(8, HEIGHT) + 0.5 * TIMING.exposure_time).numpy()
-    truth, motion = Ringing().displacement(times), found.motion.displacement(torch.from_numpy(times)).numpy()
+    truth, motion = ringing.displacement(times), found.motion.displacement(torch.from_numpy(times)).numpy()
     assert (offset_error(motion, truth) < 0.03).all()
     assert (offset_error(0.5 * truth, truth) > 1.0).all()
     error = motion - truth - (motion - truth).mean((0, 1))
@@ -172,20 +142,19 @@ def test_offsets_of_all_pairs_are_measured_despite_an_unobservable_tone():
     assert found.reliable.all()
 
 
-class Humming(Motion):
+@Curve
+def humming(times):
     """Tones at 1.04 and 0.96 times the frame rate beside an image motion."""
-
-    def displacement(self, times):
-        angle = 2 * np.pi * times / TIMING.frame_period
-        x = 1.5 * np.sin(1.04 * angle + 0.4) + 0.2 * angle
-        return np.stack([x, 1.5 * np.sin(0.96 * angle + 2.0)], axis=-1)
+    angle = 2 * np.pi * times / TIMING.frame_period
+    x = 1.5 * np.sin(1.04 * angle + 0.4) + 0.2 * angle
+    return np.stack([x, 1.5 * np.sin(0.96 * angle + 2.0)], axis=-1)
 
 
 def test_nearly_blind_tones_take_the_place_of_a_spline():
     """Tones that explain the rows as well as a spline determine also the part that all frames have in common."""
-    frames = recorded((HEIGHT, 112), TIMING, Humming(), 5, 0.005, seed=12)
+    frames = recorded((HEIGHT, 112), TIMING, humming, 5, 0.005, seed=12)
     found = rsv.detect_motion(frames, TIMING)
-    truth = Humming().displacement(found.times.numpy())
+    truth = humming.displacement(found.times.numpy())
     error = found.displacement.numpy() - (truth - truth.mean((0, 1)))
     assert (rms(error) < 0.03).all()  # a spline leaves 0.3 px and more
     assert (rms(error) < 2 * rms(found.std.numpy())).all()
@@ -193,9 +162,9 @@ def test_nearly_blind_tones_take_the_place_of_a_spline():
 
 
 def test_tones_of_two_frames_widen_the_error_bars_only():
-    frames = recorded((HEIGHT, 112), TIMING, Humming(), 2, 0.005, seed=12)
+    frames = recorded((HEIGHT, 112), TIMING, humming, 2, 0.005, seed=12)
     found = rsv.detect_motion(frames, TIMING)
-    truth = Humming().displacement(found.times.numpy())
+    truth = humming.displacement(found.times.numpy())
     error = found.displacement.numpy() - (truth - truth.mean((0, 1)))
     assert not found.motion.tones.moving_axes().any()
     assert (rms(error) < 2 * rms(found.std.numpy())).all()

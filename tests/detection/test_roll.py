@@ -195,21 +195,6 @@ def test_focal_length_gives_the_attitude_of_a_camera_with_a_wide_field():
     assert found[0] > found[1] + 1.0
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"columns": 64, "roll": True}, "columns=64 goes with roll=False"),
-        ({"roll": False, "zoom": True}, "zoom=True measures roll as well"),
-        ({"principal_point": (1.0, 2.0)}, "principal_point=.* requires focal_length"),
-        ({"distortion": (0.1, 0.0, 0.0, 0.0, 0.0)}, "distortion=.* requires focal_length"),
-        ({"focal_length": 300.0, "distortion": (-3.0, 0.0, 0.0, 0.0, 0.0)}, "not invertible in frames of 96 x 128 px"),
-    ],
-)
-def test_wrong_options_are_refused(options, message):
-    with pytest.raises((ValueError, TypeError), match=message):
-        detect_vibration(torch.rand(2, 128, 96), TIMING, **options)
-
-
 def test_commands_write_the_results_of_a_rolling_camera(rolling, tmp_path, capsys):
     text = "[sensor]\nrow_time = 8e-5\nexposure_rows = 12\nframe_rows = 280\nfull_scale = 4095\n"
     text += "[detection]\nroll = true\ntones = 1\n[restoration]\nmethod = 'dewarp'\n"

@@ -1,15 +1,12 @@
 """Tones that decay or change frequency, in frames of an independent simulator."""
 
-import math
-import re
-
 import numpy as np
 import pytest
 import torch
-from program import rsvib
-from truth import MARGIN, Curve, Motion, draw_scene, take_frames
+from truth import MARGIN, Curve, draw_scene, take_frames
 
 import rsvib_torch as rsv
+from rsvib_torch.datasets import city_and_fields
 from rsvib_torch.results.reason import Reason
 
 HEIGHT, WIDTH, FRAMES = 256, 160, 5
@@ -17,13 +14,13 @@ TIMING = rsv.SensorTiming(row_time=6e-5, exposure_rows=20, frame_rows=270)
 AMPLITUDE, FREQUENCY, DECAY, CHIRP, PHASE = (3.2, 1.1), (83.0, 30.0), (25.0, 0.0), (0.0, 520.0), (0.6, -1.1)
 
 
-class Swept(Motion):
-    def displacement(self, times):
-        axes = zip(AMPLITUDE, FREQUENCY, DECAY, CHIRP, PHASE, strict=True)
-        return np.stack(
-            [a * np.exp(-g * times) * np.sin(2 * np.pi * (f * times + c * times**2 / 2) + p) for a, f, g, c, p in axes],
-            axis=-1,
-        )
+@Curve
+def both_swept(times):
+    axes = zip(AMPLITUDE, FREQUENCY, DECAY, CHIRP, PHASE, strict=True)
+    return np.stack(
+        [a * np.exp(-g * times) * np.sin(2 * np.pi * (f * times + c * times**2 / 2) + p) for a, f, g, c, p in axes],
+        axis=-1,
+    )
 
 
 @pytest.fixture(scope="module", name="scene")
@@ -46,7 +43,7 @@ def agrees(found, times=4, share=0.002, **truths):
 
 @pytest.fixture(scope="module", name="frames")
 def make_frames(scene):
-    return taken(scene, TIMING, Swept(), FRAMES, 0.005)
+    return taken(scene, TIMING, both_swept, FRAMES, 0.005)
 
 
 @pytest.fixture(scope="module", name="found")
@@ -62,7 +59,7 @@ def test_decay_and_chirp_are_measured(found):
     assert found.phase.tolist() == pytest.approx(PHASE, abs=0.03)
     assert found.reliable.all()
     times = TIMING.row_starts(FRAMES, HEIGHT)
-    error = found.motion.displacement(times).numpy() - Swept().displacement(times.numpy())
+    error = found.motion.displacement(times).numpy() - both_swept.displacement(times.numpy())
     assert (error - error.mean((0, 1))).std() < 0.015
     truths = {"amplitude": AMPLITUDE, "frequency": FREQUENCY, "decay": DECAY, "chirp": CHIRP, "phase": PHASE}
     for name, true in truths.items():
@@ -149,6 +146,15 @@ def test_tones_that_noise_explains_as_well_are_refused():
     assert "tone_of_chance" in {reason.code for of_axis in found.findings for reason in of_axis}
 
 
+def test_a_tone_that_another_one_explains_as_well_is_refused():
+    """In three frames of 96 rows, 170 Hz was found as 211 Hz; 128 Hz explains the rows as well."""
+    timing, vibration = rsv.SensorTiming(1e-4, 6, 104), rsv.Vibration([1.2, 0.8], [130.0, 170.0], [0.3, 0.9])
+    frames = rsv.simulate_frames(city_and_fields(160, 160, seed=8), timing, vibration, 3, frame_size=(96, 96))
+    found = rsv.detect_swept_tone(frames, timing)
+    assert not found.reliable.any()
+    assert "other_swept_tone" in {reason.code for reason in found.findings[1]}
+
+
 def test_long_record_is_followed_from_the_part_with_the_largest_offsets(scene):
     # starts are searched in 67 of these 90 frames
     timing = rsv.SensorTiming(row_time=6e-5, exposure_rows=20, frame_rows=110)
@@ -158,47 +164,9 @@ def test_long_record_is_followed_from_the_part_with_the_largest_offsets(scene):
     assert agrees(found, amplitude=2.5, frequency=83.0, decay=8.0, chirp=20.0)
 
 
-def test_columns_read_in_reverse(frames, found):
-    timing = rsv.SensorTiming(6e-5, 20, 270, scan_axis=-1, readout_direction="reverse")
-    other = rsv.detect_swept_tone(frames.flip(-2).transpose(-2, -1), timing)
-    assert torch.allclose(other.frequency, found.frequency.flip(0), rtol=1e-6)
-    assert torch.allclose(other.amplitude, found.amplitude.flip(0), rtol=1e-6)
-    turned = torch.stack([found.phase[1] + math.pi, found.phase[0]])
-    difference = torch.remainder(other.phase - turned + math.pi, 2 * math.pi) - math.pi
-    assert difference.abs().max() < 1e-6
-    assert other.phase.abs().max() <= math.pi
-
-
 def test_axis_without_motion_has_no_tone(scene):
     along_x = Curve(lambda t: np.stack([2 * np.exp(-10 * t) * np.sin(2 * np.pi * 45 * t), 0 * t], -1))
     found = rsv.detect_swept_tone(taken(scene, TIMING, along_x, 3, 0.005), TIMING)
     assert found.amplitude[1] == 0
     assert found.findings[1] == (Reason("no_tone", "y"),)
     assert found.frequency[0].item() == pytest.approx(45.0, rel=0.02)
-
-
-def test_batch_equals_single_stacks(frames, found):
-    other = frames.flip(-1).contiguous()
-    both = rsv.detect_swept_tone(torch.stack([frames, other])[:, :, None], TIMING)
-    times = TIMING.row_starts(FRAMES, HEIGHT)
-    for index, single in enumerate((found, rsv.detect_swept_tone(other, TIMING))):
-        one = both[index]
-        for name in ("amplitude", "frequency", "decay", "chirp", "phase", "image_motion", "unexplained", "reliable"):
-            assert torch.equal(getattr(one, name), getattr(single, name)), name
-        assert all(torch.equal(one.std[name], single.std[name]) for name in single.std)
-        assert torch.allclose(one.motion.displacement(times), single.motion.displacement(times), atol=1e-4)
-        assert one.findings == single.findings
-
-
-def test_command(frames, tmp_path, capsys):
-    (tmp_path / "camera.toml").write_text("[sensor]\nrow_time = 6e-5\nexposure_rows = 20\nframe_rows = 270\n")
-    rsv.write_stack(tmp_path / "frames.tif", frames)
-    options = ("--config", tmp_path / "camera.toml", "--model", "swept", "--out", tmp_path / "motion.csv")
-    assert rsvib("motion", tmp_path / "frames.tif", *options) == 0
-    printed = capsys.readouterr().out
-    assert float(re.search(r"chirp \(Hz/s\) +(\S+) ± ", printed).group(1)) == pytest.approx(0, abs=12)
-    assert printed.count(": reliable") == 2
-    recorded = rsv.read_motion(tmp_path / "motion.csv", unit="px")
-    times = TIMING.row_starts(FRAMES, HEIGHT)
-    error = recorded.displacement(times).numpy() - Swept().displacement(times.numpy())
-    assert (error - error.mean((0, 1))).std() < 0.03

@@ -1,4 +1,4 @@
-"""Standard deviations that allow for a further tone, and sensitivities to the timing, on simulated displacements."""
+"""Standard deviations that allow for a further tone and for the row time, and sensitivities to the timing."""
 
 import math
 from dataclasses import replace
@@ -7,8 +7,16 @@ import numpy as np
 import pytest
 import torch
 
-from rsvib_torch.datasets import example_frames
-from rsvib_torch.detection import detect_vibration
+from rsvib_torch import (
+    FreeMotion,
+    VibrationTracker,
+    detect_motion,
+    detect_swept_tone,
+    detect_vibration,
+    follow_vibration,
+    simulate_frames,
+)
+from rsvib_torch.datasets import city_and_fields, example_frames
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.sensitivity import assumptions, timing_sensitivity
 from rsvib_torch.detection.tones.fit import displacement_std, fit_tones, vibration_of_fit, with_errors_of_blocks
@@ -194,23 +202,6 @@ def test_sensitivity_agrees_with_fits_of_other_timings(name, times):
         assert float(getattr(found, f"{of}_by_{name}")[0, 0, 0]) == pytest.approx(expected, rel=0.03, abs=2e-3)
 
 
-def test_standard_deviations_contain_that_of_the_row_time():
-    """In two frames the rows of a frame determine the frequency, which is wrong in proportion to the row time."""
-    frames, timing, _ = example_frames()
-    stated = []
-    for factor in (1.0, 1.01):  # of the row time, with the same exposure and frame rate
-        seconds = {"exposure_time": timing.exposure_time, "frame_rate": timing.frame_rate}
-        row_time = factor * timing.row_time
-        wrong = SensorTiming.from_seconds(row_time=row_time, row_time_std=0.01 * row_time, **seconds)
-        stated.append(detect_vibration(frames, wrong))
-    right, wrong = stated
-    for name in ("amplitude", "frequency", "phase"):
-        error = (getattr(wrong.vibration, name) - getattr(right.vibration, name)).abs()
-        assert torch.allclose(getattr(right.std, name), error, rtol=0.15)  # second order
-    assert torch.allclose(right.std.period, right.std.frequency / right.vibration.frequency**2)
-    assert "± 4e-07 s" in right.assumptions[0]
-
-
 def test_assumptions_state_what_the_frames_cannot_contradict():
     truth = mean_sine([2.0], [55.0], [0.4], starts_of(TIMING, 2), TIMING.exposure_time)
     fit = fitted(measured(truth, TIMING), [55.0])
@@ -226,3 +217,82 @@ def test_assumptions_state_what_the_frames_cannot_contradict():
     still = replace(vibration, frequency=0 * vibration.frequency)  # of a fit without meaning
     (of_still,) = assumptions(still, sensitivity, TIMING, 2, ROWS, np.array([[1.0, 0.5, 0.0]]))
     assert any("two frames" in text for text in of_still)
+
+
+CAMERA = SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+PLACES = torch.arange(-0.02, 0.3, 2e-4, dtype=torch.float64)
+
+
+def wrong(timing: SensorTiming, error: float, std: float) -> SensorTiming:
+    """A timing with a row time that is wrong by a relative error, with the same exposure and frame rate in s."""
+    row_time = (1 + error) * timing.row_time
+    seconds = {"exposure_time": timing.exposure_time, "frame_rate": timing.frame_rate}
+    return SensorTiming.from_seconds(row_time=row_time, row_time_std=std * row_time, **seconds)
+
+
+def frames_of(path: torch.Tensor, count: int) -> torch.Tensor:
+    """Frames of a motion with some noise."""
+    motion = FreeMotion.through(PLACES, path)
+    frames = simulate_frames(city_and_fields(280, 220, seed=3), CAMERA, motion, num_frames=count)
+    return frames + 0.002 * torch.randn(frames.shape, generator=torch.Generator().manual_seed(1))
+
+
+def decaying(frequency: float, decay: float) -> torch.Tensor:
+    """(N, 2) px along x and y."""
+    tone = torch.exp(-decay * PLACES) * torch.sin(2 * math.pi * frequency * PLACES)
+    return torch.stack([3.0 * tone, 1.5 * tone], -1)
+
+
+def test_parameters_of_swept_tones_are_within_two_standard_deviations():
+    frames, truth = frames_of(decaying(105.0, 20.0), 4), {"amplitude": (3.0, 1.5), "frequency": (105.0, 105.0)}
+    certain, found = (detect_swept_tone(frames, wrong(CAMERA, 0.01, std)) for std in (0.0, 0.01))
+    for name, true in (truth | {"decay": (20.0, 20.0), "chirp": (0.0, 0.0), "phase": (0.0, 0.0)}).items():
+        error = (getattr(found, name) - torch.tensor(true)).abs()  # px, Hz, 1/s, Hz/s, rad
+        assert bool((error < 2 * found.std[name]).all())
+        assert bool((found.std[name] < 3 * error).all())  # and they say how large the errors are
+        assert bool((found.std[name] > certain.std[name]).all())
+
+
+def test_displacements_of_free_motions_are_within_two_standard_deviations():
+    bent = PLACES.square()  # of sweeps: tones would take the place of the spline
+    path = torch.stack([1.5 * torch.sin(700 * PLACES + 900 * bent), 1.1 * torch.sin(330 * PLACES + 900 * bent)], -1)
+    frames, motion = frames_of(path, 6), FreeMotion.through(PLACES, path)
+    right, certain, found = (
+        detect_motion(frames, wrong(CAMERA, *of)) for of in ((0.0, 0.0), (0.01, 0.0), (0.01, 0.01))
+    )
+    true = motion.displacement(found.times)
+    error = (found.displacement - true + true.mean((0, 1))).abs()
+    assert float((error < 2 * found.std).double().mean()) > 0.95
+    by_row_time = (found.std.square() - certain.std.square()).clamp(min=0).mean((0, 1)).sqrt()
+    at_right = right.motion.displacement(found.times) - found.motion.displacement(found.times)
+    changed = (at_right - at_right.mean((0, 1))).square().mean((0, 1)).sqrt()
+    assert torch.allclose(by_row_time, changed, rtol=0.3)
+
+
+def test_tones_that_are_followed_are_within_two_standard_deviations():
+    frames, timing = frames_of(decaying(61.0, 1 / 0.3), 16), wrong(CAMERA, 0.01, 0.01)
+    followed = follow_vibration(frames, timing)
+    inner = slice(3, -3)
+    envelope = torch.exp(-followed.times / 0.3)[:, None]
+    amplitude = (followed.vibration.amplitude[..., 0] / envelope - torch.tensor([3.0, 1.5])).abs()[inner]
+    std = followed.std.amplitude[inner, :, 0] / envelope[inner]
+    assert bool((amplitude < 2 * std).all())
+    assert bool((std.mean(0) < 3 * amplitude.mean(0)).all())
+    assert bool(((followed.vibration.frequency - 61.0).abs() < 2 * followed.std.frequency)[inner].all())
+    # A tracker has its standard deviations from the same function.
+    tracker, starts = VibrationTracker(timing), timing.frame_starts(16).tolist()
+    for frame, start in zip(frames, starts, strict=True):
+        tracked = tracker.update(frame, start)
+    error = tracked.detection.vibration.amplitude[:, 0] / envelope[-1] - torch.tensor([3.0, 1.5])
+    assert bool((error.abs() < 2 * tracked.detection.std.amplitude[:, 0] / envelope[-1]).all())
+
+
+def test_standard_deviations_contain_that_of_the_row_time():
+    """In two frames the rows of a frame determine the frequency, which is wrong in proportion to the row time."""
+    frames, timing, _ = example_frames()
+    right, other = (detect_vibration(frames, wrong(timing, error, 0.01)) for error in (0.0, 0.01))
+    for name in ("amplitude", "frequency", "phase"):
+        error = (getattr(other.vibration, name) - getattr(right.vibration, name)).abs()
+        assert torch.allclose(getattr(right.std, name), error, rtol=0.15)  # second order
+    assert torch.allclose(right.std.period, right.std.frequency / right.vibration.frequency**2)
+    assert "± 4e-07 s" in right.assumptions[0]

@@ -14,16 +14,12 @@ from rsvib_torch.motion.vibration import VibrationStd
 TIMING = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=2048)
 
 
-def same(curve):
-    return curve
-
-
 def verdict(amplitude=3.0, frequency=30.0, *, std=(0.01, 0.01), displacement_std=0.01, known_std=None, **options):
     """Reasons against a vibration along x (y: 2 px at 50 Hz) with 40 bands, or with the motion of ``rows``."""
     vibration = Vibration([[[amplitude], [2.0]]], [[[frequency], [50.0]]])
     size, hertz = (torch.tensor([[[value], [0.01]]], dtype=torch.float64) for value in std)
     curve, nothing = np.sin(np.linspace(0, 12, 40))[:, None] * np.array([3.0, 2.0]), torch.zeros(1, 2)
-    offsets, fitted = (options.pop(name, same)(curve)[None] for name in ("offsets", "fitted"))
+    offsets, fitted = (options.pop(name, lambda same: same)(curve)[None] for name in ("offsets", "fitted"))
     bands = compared_bands(offsets, fitted, np.ones((1, 40), dtype=bool))
     (findings,) = judged(
         vibration,

@@ -108,18 +108,3 @@ def test_integer_frames_are_scaled():
     scaled = as_float_frames(deep, 4095)
     assert scaled.dtype == torch.float32
     assert scaled.flatten().tolist() == pytest.approx([0.0, 1.0, 0.2])
-
-
-@pytest.mark.parametrize(
-    ("frames", "options", "error", "message"),
-    [
-        (torch.zeros(2, 4, 4, dtype=torch.uint16), {}, ValueError, "full scale of uint16 frames unknown: pass full_sc"),
-        (torch.zeros(2, 4, 4, dtype=torch.uint8), {"full_scale": 0}, ValueError, "full_scale must be larger than 0"),
-        (torch.zeros(4, 4), {}, ValueError, r"frames must have shape .* got \(4, 4\)"),
-        (torch.zeros(2, 4, 4, dtype=torch.complex64), {}, TypeError, "frames must be real numbers"),
-        (torch.zeros(1, 4, 4), {"minimum_frames": 2}, ValueError, "at least 2 frames are needed, got 1"),
-        (torch.tensor([[[0.0, torch.nan]]]), {}, ValueError, r"pixel \(0, 0, 1\) is nan"),
-    ],
-)
-def test_bad_frames(frames, options, error, message):
-    refuses(lambda: as_float_frames(frames, **options), message, error)

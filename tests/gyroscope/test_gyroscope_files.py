@@ -11,10 +11,6 @@ import rsvib_torch as rsv
 from rsvib_torch.gyroscope import read_camera_track
 
 
-def lines_of(times, rates):
-    return [",".join(f"{value:.10g}" for value in (time, *row)) for time, row in zip(times, rates, strict=True)]
-
-
 def gcsv(path, *, orientation="XYZ", columns="t,gx,gy,gz,ax,ay,az", rows=None):
     """A gyroflow log with times in ms and rates in units of 0.5 mrad/s."""
     raw = np.round(RATES / 5e-4).astype(int)
@@ -48,7 +44,7 @@ def test_orientation_of_a_gyroflow_log(tmp_path):
 )
 def test_csv(tmp_path, names, factor, options):
     path = tmp_path / "clip.csv"
-    path.write_text("\n".join([names, *lines_of(TIMES * factor[0], RATES * factor[1])]))
+    np.savetxt(path, np.column_stack([TIMES * factor[0], RATES * factor[1]]), "%.10g", ",", header=names, comments="")
     found = rsv.read_gyroscope(path, **options)
     assert np.allclose(found.times.numpy(), TIMES, atol=1e-9)
     assert np.allclose(found.rates.numpy(), RATES, atol=1e-8)
@@ -88,7 +84,6 @@ def test_gopro_times_are_those_of_the_video(tmp_path):
         (lambda path: mp4(path, packets_of(), offsets=[2**31] * 3), "a video without a GPMF track"),
         (lambda path: mp4(path, [packets_of()[0][:-40]] * 3), "damaged MP4 file: a GPMF entry"),
         (lambda path: path.write_bytes(box(b"ftyp", b"mp41") + b"\xff\xff\xff\xffmdat"), "damaged MP4 file"),
-        (lambda path: path.write_bytes(box(b"ftyp", b"mp41")), "damaged MP4 file"),
     ],
 )
 def test_damaged_files_are_refused_in_one_line(tmp_path, write, message):

@@ -79,21 +79,17 @@ def test_nodes_integrate(quadrature, exposure_rows):
         assert len(times) == math.ceil(exposure_rows)
 
 
-def fast_motion(batch=None):
-    """A motion with large differences between the rows of a small frame."""
-    amplitude = torch.tensor([[3.3], [2.4]], dtype=torch.float64)
-    if batch is not None:
-        amplitude = amplitude * torch.linspace(0.4, 1.3, batch, dtype=torch.float64)[:, None, None]
-    return Vibration(amplitude, [[2000.0], [1300.0]], [[0.4], [1.1]], [900.0, -700.0])
-
-
 SMALL = SensorTiming(row_time=20e-6, exposure_rows=6, frame_rows=64)
 
 
 def small_psf(interpolation, rows=14, batch=None):
-    starts = SMALL.row_starts(1, rows)[0]
-    starts = starts if batch is None else starts.expand(batch, -1)
-    return row_psf(fast_motion(batch), starts, SMALL, interpolation=interpolation)
+    """Of a motion with large differences between the rows of a small frame."""
+    starts, amplitude = SMALL.row_starts(1, rows)[0], torch.tensor([[3.3], [2.4]], dtype=torch.float64)
+    if batch is not None:
+        starts = starts.expand(batch, -1)
+        amplitude = amplitude * torch.linspace(0.4, 1.3, batch, dtype=torch.float64)[:, None, None]
+    motion = Vibration(amplitude, [[2000.0], [1300.0]], [[0.4], [1.1]], [900.0, -700.0])
+    return row_psf(motion, starts, SMALL, interpolation=interpolation)
 
 
 def noise(*shape, seed=0, dtype=torch.float64):
@@ -123,20 +119,21 @@ def test_output_row_selects_its_kernel(interpolation):
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
-@pytest.mark.parametrize("scene_lead", [(), (3,), (2, 1), (2, 3)])
-def test_adjoint_of_batches(interpolation, scene_lead):
+@pytest.mark.parametrize(("scene_lead", "origin"), [((), (0, 0)), ((3,), (1, -2)), ((2, 1), (0, 0)), ((2, 3), (-3, 4))])
+def test_adjoint_of_batches(interpolation, scene_lead, origin):
+    """<A x, y> = <x, A^T y>."""
     psf = small_psf(interpolation, batch=3)
     scene = noise(*scene_lead, 24, 28, seed=1)
-    frame = blur_rows(scene, psf, frame_width=18)
+    frame = blur_rows(scene, psf, frame_width=18, origin=origin)
     lead = torch.broadcast_shapes(scene_lead, (3,))
     assert frame.shape == (*lead, 14, 18)
     other = noise(*frame.shape, seed=2)
-    back = blur_rows_adjoint(other, psf, tuple(scene.shape))
+    back = blur_rows_adjoint(other, psf, tuple(scene.shape), origin=origin)
     assert back.shape == scene.shape
     assert (frame * other).sum().item() == pytest.approx((scene * back).sum().item(), rel=1e-11)
     for index in range(3):
         one = RowPSF(psf.first_tap[index], psf.weights[index], psf.degree)
-        expected = blur_rows(scene.expand(*lead, 24, 28)[..., index, :, :], one, frame_width=18)
+        expected = blur_rows(scene.expand(*lead, 24, 28)[..., index, :, :], one, frame_width=18, origin=origin)
         torch.testing.assert_close(frame[..., index, :, :], expected, rtol=0, atol=1e-12)
 
 

@@ -1,47 +1,19 @@
-"""Frame times and rates stated by files: used and kept by every command, and compared with the sensor."""
+"""Frame times and rates stated by files, compared with the sensor."""
 
-import json
 import re
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
-from program import rsvib
-from small_stack import CAMERA, MOTION, STILL, TIMING, write_with_gaps
-from truth import decibel
+from small_stack import TIMING
 
 import rsvib_torch as rsv
-from rsvib_torch import StackInfo, read_stack_info
+from rsvib_torch import StackInfo
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io import TimingWarning, describe_stack, exposure_times, timing_from_first_frame
 
 KEPT = [0, 1, 2, 4, 5, 9, 10]  # the other frames were dropped
-START = 100.25  # s
-
-
-@pytest.fixture(name="place")
-def write_stack_with_gaps(tmp_path):
-    """Frames with gaps in a file that states their times, and a config without frame times."""
-    write_with_gaps(tmp_path, KEPT, START)
-    (tmp_path / "camera.toml").write_text(CAMERA)
-    return tmp_path
-
-
-def test_commands_use_and_keep_the_times_of_the_file(place):
-    config = ("--config", place / "camera.toml")
-    assert rsvib("detect", place / "frames.raw", *config, "--out", place / "found") == 0
-    found = json.loads((place / "found" / "vibration.json").read_text())
-    assert found["timing"]["frame_start_times"] == pytest.approx([index * TIMING.frame_period for index in KEPT])
-    assert found["vibration"]["frequency"][0][0] == pytest.approx(MOTION.frequency[0], rel=0.01)
-    assert found["vibration"]["phase"][0][0] == pytest.approx(MOTION.phase[0], abs=0.1)
-    vibration = ("--vibration", place / "found" / "vibration.json")
-    assert rsvib("restore", place / "frames.raw", place / "restored.h5", *config, *vibration) == 0
-    restored = rsv.read_stack(place / "restored.h5").numpy()
-    assert min(decibel(frame, STILL, 12) for frame in restored) > 34
-    info = read_stack_info(place / "restored.h5")
-    assert info.frame_times == pytest.approx([START + index * TIMING.frame_period for index in KEPT])
-    assert info.resolution[:2] == pytest.approx((120.0, 60.0))
 
 
 def info_with(times, error=1e-3):
@@ -133,11 +105,9 @@ def test_exact_times_may_be_those_of_every_nth_frame():
     [
         (("f_0", "f_1", "f_3", "f_4"), (0, 1, 3, 4)),
         (("f_8", "f_10", "f_12", "f_20"), (0, 1, 2, 6)),  # every second frame was kept
-        (("cam2_f07", "cam2_f08", "cam2_f10", "cam2_f11"), (0, 1, 3, 4)),
         (("f_98", "f_99", "f_100", "f_101"), None),
         (("f_0", "f_33", "f_67", "f_100"), None),  # ms
         (("2024-05-01_10-00-00", "2024-05-01_10-00-01", "2024-05-02_09-00-00"), None),
-        (("dark", "flat", "scene"), None),
     ],
 )
 def test_missing_numbers_in_file_names_are_missing_frames(tmp_path, names, numbers):

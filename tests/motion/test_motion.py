@@ -1,12 +1,17 @@
-"""The contract of ``Motion``, checked for every motion type."""
+"""The contract of ``Motion`` for every type; vibrations; splines compared with SciPy and in simulated frames."""
 
 import math
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from refusals import refuses
+from scipy.interpolate import CubicSpline
+from truth import MARGIN, Curve, decibel, draw_scene, take_frames
 
-from rsvib_torch import FreeMotion, Vibration
+import rsvib_torch as rsv
+from rsvib_torch import FreeMotion, SensorTiming, Vibration, VibrationStd, blind_frequencies
 
 TONES = Vibration(
     amplitude=[[3.1, 0.4], [5.2, 0.7]],
@@ -87,3 +92,124 @@ def test_detached_motion_has_no_gradients():
     assert motion.displacement(TIMES).requires_grad
     assert not motion.detached().displacement(TIMES).requires_grad
     assert not motion.largest_displacement(0.0, 1.0).requires_grad
+
+
+TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
+AMPLITUDE = np.array([[3.1, 0.4], [5.2, 0.7]])
+FREQUENCY = np.array([[50.0, 155.0], [30.0, 88.0]])
+PHASE = np.array([[0.4, -1.0], [1.3, 2.2]])
+MOTION = np.array([120.0, -40.0])
+
+
+def vibration():
+    return Vibration(*(torch.from_numpy(part) for part in (AMPLITUDE, FREQUENCY, PHASE, MOTION)))
+
+
+def displacement(times):
+    angle = 2 * np.pi * FREQUENCY * times[..., None, None] + PHASE
+    return (AMPLITUDE * np.sin(angle)).sum(-1) + MOTION * times[..., None]
+
+
+def test_displacement_is_equation_1():
+    times = np.linspace(-0.1, 0.3, 57).reshape(3, 19)
+    assert vibration().displacement(torch.from_numpy(times)).numpy() == pytest.approx(displacement(times), abs=1e-12)
+
+
+def test_blind_frequencies():
+    found = blind_frequencies(TIMING, 100.0)
+    assert found.tolist() == pytest.approx([23.795, 47.591, 71.386, 95.182], abs=1e-3)
+    high = blind_frequencies(TIMING, 5000.0)
+    assert high.tolist() == sorted(high.tolist())
+    for j in (1, 2):
+        assert (high - j / TIMING.exposure_time).abs().min() < 1e-9
+    starts = TIMING.row_starts(1, 2048)[0]
+    for frequency in found.tolist():
+        tone = Vibration(5.0, frequency, 0.7)
+        assert tone.offset(starts, starts + TIMING.frame_period, TIMING.exposure_time).abs().max() < 1e-9
+    averaged = Vibration(5.0, 1 / TIMING.exposure_time, 0.7)
+    assert averaged.mean_displacement(starts, TIMING.exposure_time).abs().max() < 1e-9
+
+
+def test_uneven_frames_are_blind_to_frequencies_that_displace_all_frames_alike():
+    period = TIMING.frame_period
+    pair = blind_frequencies(replace(TIMING, frame_start_times=(0.0, 2 * period)), 50.0)
+    torch.testing.assert_close(pair, torch.arange(1, 5).double() / (2 * period))
+    three = blind_frequencies(replace(TIMING, frame_start_times=(0.0, 2 * period, 5 * period)), 50.0)
+    torch.testing.assert_close(three, torch.arange(1, 3).double() / period)
+    assert not len(blind_frequencies(replace(TIMING, frame_start_times=(0.0, period, 2.37 * period)), 90.0))
+
+
+def test_tones_are_sorted_by_amplitude():
+    mixed = Vibration([[0.4, 3.1], [5.2, 0.7]], [[155.0, 50.0], [30.0, 88.0]], [[-1.0, 0.4], [1.3, 2.2]], MOTION)
+    for name in ("amplitude", "frequency", "phase", "image_motion"):
+        assert torch.equal(getattr(mixed, name), getattr(vibration(), name))
+
+
+@pytest.mark.parametrize(("scan_axis", "order"), [(-2, [0, 1]), (-1, [1, 0])])
+def test_standard_deviations_in_image_axes(scan_axis, order):
+    tones = [torch.arange(4.0).reshape(2, 2) + offset for offset in (0, 4, 8, 12)]
+    axes = [torch.tensor([1.0, 2.0]), torch.tensor([3.0, 4.0]), torch.tensor([5.0, 6.0])]
+    camera = replace(TIMING, scan_axis=scan_axis, readout_direction="reverse")
+    std = VibrationStd(*tones, *axes).from_row_order(camera)
+    for name, values in zip(VibrationStd.__dataclass_fields__, (*tones, *axes), strict=True):
+        assert torch.equal(getattr(std, name), values[order])
+
+
+SAMPLED = np.arange(0, 0.2, 1e-3)
+CURVED = np.stack([6 * np.sin(40 * SAMPLED) * np.exp(-8 * SAMPLED), 4 * np.cumsum(np.sin(300 * SAMPLED**2)) / 20], -1)
+LONG_EXPOSURES = rsv.SensorTiming(row_time=4e-5, exposure_rows=40, frame_rows=400)
+
+
+def spline():
+    return CubicSpline(SAMPLED, CURVED, bc_type="natural")
+
+
+def natural():
+    return FreeMotion.through(SAMPLED, CURVED)
+
+
+@pytest.mark.parametrize("clock", [1 - 1e-12, 1.0, 1 + 1e-12])
+def test_rounding_does_not_change_the_number_of_knots(clock):
+    found = FreeMotion.from_samples(SAMPLED * clock, CURVED, spacing=1e-3 * clock)
+    assert found.coefficients.shape == natural().coefficients.shape
+
+
+def test_displacement_velocity_and_mean_are_those_of_a_natural_spline():
+    times = np.random.default_rng(0).uniform(0.0, SAMPLED[-1], 200)
+    given = torch.from_numpy(times)
+    assert np.allclose(natural().displacement(given).numpy(), spline()(times), atol=1e-6)
+    assert np.allclose(natural().velocity(given).numpy(), spline()(times, 1), atol=1e-3)
+    exposure = 1.6e-3
+    starts = np.linspace(0, 0.19, 50)
+    mean = np.stack([spline().integrate(a, a + exposure) / exposure for a in starts])
+    assert np.allclose(natural().mean_displacement(torch.from_numpy(starts), exposure).numpy(), mean, atol=2e-6)
+
+
+def test_motion_is_constant_beyond_its_ends():
+    ends = natural().displacement(torch.tensor([-1.0, 5.0], dtype=torch.float64)).numpy()
+    assert np.allclose(ends, CURVED[[0, -1]], atol=1e-6)
+    assert not natural().velocity(torch.tensor([-1.0, 5.0])).any()
+
+
+def test_tones_are_added_to_the_spline():
+    tones = rsv.Vibration([1.0, 0.5], [70.0, 90.0], [0.3, 0.4], [10.0, -5.0])
+    whole = FreeMotion.through(SAMPLED, CURVED, tones)
+    times = torch.linspace(0, 0.19, 30, dtype=torch.float64)
+    assert torch.allclose(whole.displacement(times), natural().displacement(times) + tones.displacement(times))
+    assert torch.allclose(whole.velocity(times), natural().velocity(times) + tones.velocity(times))
+
+
+def test_samples_at_uneven_times():
+    times = np.sort(np.random.default_rng(1).uniform(0, 0.199, 300))
+    uneven = FreeMotion.from_samples(times, spline()(times))
+    inside = torch.linspace(0.01, 0.19, 100, dtype=torch.float64)
+    assert (uneven.displacement(inside) - natural().displacement(inside)).abs().amax() < 0.02
+
+
+FREE = Curve(spline())  # the same path for the independent simulator
+
+
+def test_simulated_frames_equal_those_of_the_independent_simulator():
+    scene = draw_scene(320 + 2 * MARGIN, 192 + 2 * MARGIN, 2)
+    frames = rsv.simulate_frames(torch.from_numpy(scene), LONG_EXPOSURES, natural(), 2, frame_size=(320, 192))
+    assert decibel(frames.numpy(), take_frames(scene, LONG_EXPOSURES, FREE, 2), rim=16) > 60

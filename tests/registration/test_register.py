@@ -1,11 +1,14 @@
-from dataclasses import replace
+"""Offsets of bands against truth, with large shifts, failed bands, and shading that is fixed to the camera."""
+
 from typing import get_args
 
 import numpy as np
 import pytest
 import torch
-from truth import Motion, draw_scene, recorded
+from scipy import ndimage
+from truth import MARGIN, Curve, Motion, draw_scene, recorded, take_frames
 
+import rsvib_torch as rsv
 from rsvib_torch import SensorTiming, register_bands
 from rsvib_torch.options import Registration
 
@@ -156,47 +159,47 @@ def test_offsets_do_not_depend_on_brightness_and_contrast(pair, paper_camera, me
     torch.testing.assert_close(one, other, rtol=0, atol=2e-3, equal_nan=True)
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_batch_channels_and_pairs_equal_singles(pair, paper_camera, method):
-    frames = pair[0][:, :512, :256]
-    three = torch.cat([frames, frames[:1]])
-    other = three.flip(-1)
-    batch = torch.stack([three, other])[:, :, None].repeat(1, 1, 2, 1, 1)
-    together = register_bands(batch, paper_camera, method=method)
-    assert together.offsets.shape[:2] == (2, 2)
-    assert together.pairs.tolist() == [[0, 1], [1, 2]]
-    for index, stack in enumerate((three, other)):
-        for p in range(2):
-            alone = register_bands(stack[p : p + 2], paper_camera, method=method)
-            torch.testing.assert_close(together[index].offsets[p], alone.offsets[0], rtol=0, atol=2e-4, equal_nan=True)
-            torch.testing.assert_close(together[index].quality[p], alone.quality[0], rtol=0, atol=1e-4)
+SIZE = 256
+TIMING = rsv.SensorTiming(row_time=1 / 30 / SIZE, exposure_rows=1, frame_rows=SIZE)
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("scan_axis", [-2, -1])
-def test_orientation(pair, paper_camera, method, scan_axis):
-    frames = pair[0][:, :512, :256]
-    upright = register_bands(frames, paper_camera, method=method)
-    turned = frames.flip(-2) if scan_axis == -2 else frames.flip(-2).transpose(-2, -1)
-    timing = replace(paper_camera, scan_axis=scan_axis, readout_direction="reverse")
-    result = register_bands(turned, timing, method=method)
-    expected = upright.offsets * torch.tensor([1.0, -1.0])
-    expected = expected.flip(-1) if scan_axis == -1 else expected
-    torch.testing.assert_close(result.offsets, expected, rtol=0, atol=1e-6, equal_nan=True)
-    assert torch.equal(result.rows, upright.rows)
-    assert torch.equal(result.times, upright.times)
-    assert result.heights == (upright.heights[::-1] if scan_axis == -1 else upright.heights)
+@Curve
+def wander(times):
+    """Drift of an eye: steps of a random walk smoothed over a fifth of a frame, no sinusoid."""
+    generator = np.random.default_rng(8)
+    grid = np.arange(-0.2, 0.8, 1e-3)
+    walk = np.cumsum(generator.standard_normal((len(grid), 2)), axis=0)
+    path = ndimage.gaussian_filter1d(walk, 6.0, axis=0)
+    path = 2.5 * (path - path.mean(0)) / path.std(0)
+    return np.stack([np.interp(times, grid, path[:, axis]) for axis in range(2)], axis=-1)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"method": "sift"}, "registration must be 'projection', 'ncc' or 'phase', got 'sift'"),
-        ({"search": 60}, "frames of 256 x 200 px .* bands of 32 rows searched over 60 px: .*; reduce search$"),
-        ({"band_rows": 240}, "too small for bands of 240 rows .*; reduce band_rows or search$"),
-    ],
-)
-def test_bad_options(paper_camera, options, message):
-    frames = torch.rand(2, 256, 200, generator=torch.Generator().manual_seed(0))
-    with pytest.raises(ValueError, match=message):
-        register_bands(frames, paper_camera, **options)
+@pytest.fixture(scope="module", name="recording")
+def make_recording():
+    scene = draw_scene(SIZE + 2 * MARGIN, SIZE + 2 * MARGIN, 4)
+    motion = wander
+    frames = take_frames(scene, TIMING, motion, 4)
+    v, u = np.meshgrid(np.linspace(-1, 1, SIZE), np.linspace(-1, 1, SIZE), indexing="ij")
+    vignette = 0.1 + 0.9 * np.exp(-(u**2 + v**2) / 0.35)
+    speckle = 0.03 * np.random.default_rng(1).standard_normal(frames.shape)
+    return torch.from_numpy(vignette * frames + speckle).float(), motion
+
+
+def offsets_between(frames, first, second):
+    starts = [first * TIMING.frame_period, second * TIMING.frame_period]
+    timing = rsv.SensorTiming(TIMING.row_time, 1, TIMING.frame_rows, frame_start_times=starts)
+    curve = rsv.register_bands(frames[[first, second]], timing, search=24)
+    return curve.rows.numpy(), curve.offsets[0].numpy()
+
+
+@pytest.mark.parametrize("pair", [(0, 1), (1, 2), (0, 2)])
+def test_offsets_are_those_of_the_tissue_not_of_the_vignette(recording, pair):
+    frames, motion = recording
+    rows, offsets = offsets_between(frames, *pair)
+    then = pair[0] * TIMING.frame_period + rows * TIMING.row_time
+    later = pair[1] * TIMING.frame_period + (rows + np.nan_to_num(offsets[:, 1])) * TIMING.row_time
+    truth = motion.displacement(later) - motion.displacement(then)
+    assert np.abs(truth).mean() > 0.8
+    error = offsets - truth
+    assert np.isfinite(error).all(1).mean() > 0.8
+    assert np.nanmedian(np.abs(error), axis=0).max() < 0.15

@@ -1,4 +1,4 @@
-"""Result files and figures."""
+"""Result files, manifests and figures."""
 
 import csv
 import json
@@ -15,10 +15,16 @@ from rsvib_torch.detection import DetectionResult
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.report.plots import comparison_figure, detailed_places, offset_figure, save_figure
-from rsvib_torch.report.results import read_vibration, write_offsets, write_restoration, write_vibration
+from rsvib_torch.report.results import (
+    check_same_timing,
+    read_vibration,
+    write_offsets,
+    write_restoration,
+    write_vibration,
+)
 from rsvib_torch.restoration import RestorationVerdict
 from rsvib_torch.results.reason import Reason
-from rsvib_torch.stacks import RestoredFrames
+from rsvib_torch.stacks import RestoredFrames, read_manifest
 
 TIMING = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
 
@@ -199,3 +205,33 @@ def test_comparison_draws_the_same_crop_of_both_frames(tmp_path, shape):
         assert after.get_array().mean() < before.get_array().mean()  # the grey scale is common to both
     save_figure(figure, tmp_path / "before_after.png", dpi=40)
     assert (tmp_path / "before_after.png").stat().st_size > 1000
+
+
+WINDOW = {"window": 0, "first": 0, "last": 3, "start_time": 0.0, "written": 4, "frames": "as taken", "left_alone": []}
+WINDOW |= dict.fromkeys(("detection", "outcome", "summary", "predicted_gain"))
+WINDOW |= {"error": "all pixels of frame 2 are equal", "bad_frames": {"2": "all pixels are equal"}}
+MANIFEST = {"format": "rsvib stack", "version": 1, "output": None, "windows": [WINDOW, WINDOW | {"window": 1}]}
+MANIFEST |= {name: {} for name in ("input", "settings", "versions", "bad_frames")}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"windows": [WINDOW, WINDOW]}, r"windows\[1\]\.window: expected 1, got 0"),
+        ({"windows": [WINDOW | {"first": "0"}]}, r"windows\[0\]: first must be a whole number, got '0'"),
+        ({"windows": [{}]}, r"windows\[0\]\.window: missing key"),
+        ({"windows": [WINDOW | {"detection": {}}]}, r"windows\[0\]\.detection\.vibration: missing key"),
+        ({"version": 2}, "expected format 'rsvib stack' of version 1"),
+    ],
+)
+def test_manifests_that_do_not_fit_are_refused(tmp_path, change, message):
+    path = tmp_path / "manifest.json"
+    path.write_text(json.dumps(MANIFEST))
+    assert [record.error for record in read_manifest(path).windows] == [WINDOW["error"]] * 2
+    path.write_text(json.dumps(MANIFEST | change))
+    with pytest.raises(ValueError, match=message):
+        read_manifest(path)
+
+
+def test_timings_are_compared_up_to_rounding():
+    check_same_timing("vibration.json", TIMING, replace(TIMING, row_time=TIMING.row_time * (1 + 1e-12)))

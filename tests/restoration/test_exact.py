@@ -1,9 +1,13 @@
+"""Method ``"exact"``: its solver, accuracy, segments, gradients, prior of edges, and strength of the prior."""
+
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
 from exact_steps import model_of, solved
+from scipy import fft, ndimage
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration, psnr, simulate_frames
@@ -11,11 +15,14 @@ from rsvib_torch.datasets import city_and_fields
 from rsvib_torch.restoration import restore as restore_by_any_method
 from rsvib_torch.restoration import visible_pixels
 from rsvib_torch.restoration.exact.exact import model_frames
-from rsvib_torch.restoration.exact.priors import PRIORS, Prior
-from rsvib_torch.restoration.exact.scene_solver import Partition
+from rsvib_torch.restoration.exact.priors import PRIORS, Prior, shrink_patches
+from rsvib_torch.restoration.exact.scene_solver import Partition, SceneSolver, join_windows, row_windows
 from rsvib_torch.restoration.frame_motion import MovingFrames, frame_motion
+from rsvib_torch.restoration.scene_model.observation import Observation, RowKernels
+from rsvib_torch.restoration.scene_model.scene_prior import RowPrior, fit_prior
 
 restore = partial(restore_by_any_method, method="exact")
+quietly = partial(restore, check=False)
 TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
 
 
@@ -197,3 +204,194 @@ def test_a_batch_equals_single_stacks(rows, joint):
     together = restore(frames[:, :, None], timing, Vibration.stacked(motions), joint=joint, check=False)
     for images, motion, found in zip(frames, motions, together[:, :, 0], strict=True):
         torch.testing.assert_close(found, restore(images, timing, motion, joint=joint, check=False), rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("offset", [(0, 0), (1, 0), (1, 1)])
+def test_patches_agree_with_a_loop_over_dct(offset):
+    image = np.random.default_rng(0).standard_normal((71, 13))  # more rows than are shrunk at a time
+    padded = np.pad(image, 8, mode="edge")
+    total, weights = np.zeros_like(padded), np.zeros_like(padded)
+    for row in range(offset[0], padded.shape[0] - 7, 2):
+        for column in range(offset[1], padded.shape[1] - 7, 2):
+            patch = fft.dctn(padded[row : row + 8, column : column + 8], norm="ortho")
+            strong = abs(patch) > 2.0 * 0.6
+            strong[0, 0] = True
+            total[row : row + 8, column : column + 8] += fft.idctn(patch * strong, norm="ortho") / strong.sum()
+            weights[row : row + 8, column : column + 8] += 1 / strong.sum()
+    found = shrink_patches(torch.from_numpy(image)[None], 0.6, offset)[0].numpy()
+    np.testing.assert_allclose(found, total[8:-8, 8:-8] / weights[8:-8, 8:-8], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("seed", "exposure_rows", "joint", "gain"),
+    [(41, 20, False, 0.15), (41, 20, True, 0.15), (5, 100, False, 0.2), (5, 400, True, 0.2)],
+)
+def test_psnr_exceeds_that_of_the_gaussian_prior(seed, exposure_rows, joint, gain):
+    scene, vibration = draw_scene(272, 240, seed=seed), Motion().vibration()
+    timing = SensorTiming(row_time=20.52e-6, exposure_rows=exposure_rows, frame_rows=2048)
+    frames = as_tensor(take_frames(scene, timing, Motion(), 2, 0.02))
+    plain, kept = (quietly(frames, timing, vibration, joint=joint, prior=prior) for prior in ("gaussian", "edges"))
+    assert kept.shape == plain.shape
+    assert decibel(kept, crop(scene)) > decibel(plain, crop(scene)) + gain
+
+
+def test_steps_have_less_overshoot_and_noise():
+    scene = np.full((256, 256), 0.25)
+    scene[128:] = 0.75
+    scene = ndimage.gaussian_filter(scene, 0.8)
+    timing = SensorTiming(row_time=20.52e-6, exposure_rows=100, frame_rows=2048)
+    frames = as_tensor(take_frames(scene, timing, Motion(), 1, 0.02))
+    plain, kept = (
+        quietly(frames, timing, Motion().vibration(), prior=prior)[0].numpy() for prior in ("gaussian", "edges")
+    )
+    overshoots = []
+    for image in (plain, kept):
+        profile = image[32:-32, 32:-32].mean(1)
+        overshoots.append(max(profile.max() - 0.75, 0.25 - profile.min()))
+    assert overshoots[1] < overshoots[0]
+    assert decibel(kept, crop(scene)) > decibel(plain, crop(scene)) + 4
+
+
+def test_gradients_to_frames_and_flat_scenes():
+    flat = torch.full((1, 48, 40), 0.37, dtype=torch.float64)
+    kept = quietly(flat, TIMING, Vibration(1.0, 50.0), prior="edges", noise=0.05)
+    assert (kept - 0.37).abs().max() < 1e-9
+    frames = torch.rand(1, 24, 20, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    quietly(frames, TIMING, Vibration(1.0, 50.0), prior="edges", noise=0.05).square().sum().backward()
+    assert torch.isfinite(frames.grad).all()
+    assert frames.grad.abs().min() > 0
+
+
+MOTION = Motion()
+SIZE = 300
+
+
+def texture(blur):
+    noise = ndimage.gaussian_filter(np.random.default_rng(1).standard_normal((SIZE, SIZE)), blur, mode="wrap")
+    return np.clip(0.5 + 0.15 * noise / noise.std(), 0, 1)
+
+
+SCENES = {
+    "buildings": partial(draw_scene, SIZE, SIZE, 14),
+    "soft": partial(draw_scene, SIZE, SIZE, 5, blur=2.5),
+    "dense texture": partial(texture, 0.7),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "rows", "noise", "given", "joint", "least", "within"),
+    [
+        ("buildings", 20, 0.02, 2, False, -0.1, 0.3),
+        ("soft", 100, 0.05, 2, True, 1.0, 0.3),
+        ("dense texture", 100, 0.001, 1, False, -0.1, 0.5),
+        ("dense texture", 20, 0.001, 2, True, -0.1, 0.3),
+    ],
+)
+def test_estimated_strength_is_close_to_the_best(name, rows, noise, given, joint, least, within):
+    timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
+    scene = SCENES[name]()
+    clean = take_frames(scene, timing, MOTION, 2)
+    frames = torch.from_numpy(clean + noise * np.random.default_rng(3).standard_normal(clean.shape)).float()[:given]
+    found = decibel(quietly(frames, timing, MOTION.vibration(), joint=joint)[0], crop(scene))
+    stack = model_of(frames, timing, MOTION.vibration())
+    by_hand = {
+        factor: decibel(solved(stack, joint=joint, regularisation=factor)[0], crop(scene))
+        for factor in (0.03, 0.1, 0.3, 1.0, 3.0)
+    }
+    assert found > max(by_hand.values()) - within
+    assert found > by_hand[1.0] + least
+    assert max(by_hand.values()) - min(by_hand.values()) > 0.5
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_power_of_pure_noise_is_close_to_zero(count):
+    noise = torch.randn(count, 1, 512, 512, generator=torch.Generator().manual_seed(0))
+    motion = frame_motion(MOTION.vibration().expanded(1), TIMING, count, 512)
+    prior = fit_prior((0.5 + 0.02 * noise)[None], motion, torch.full((1, count), 0.02), 576)
+    assert prior.power.mean() < 0.08 * 0.02**2
+    assert fit_prior((0.5 + 0.04 * noise)[None], motion, torch.full((1, count), 0.02), 576).power.mean() > 2 * 0.02**2
+
+
+@pytest.mark.parametrize(("across", "along", "joint"), [(0.2, 0.05, True), (0.02, 0.1, False)])
+def test_regular_patterns_are_restored_up_to_the_boundaries(across, along, joint):
+    rows, columns = np.mgrid[:336, :400]
+    scene = 0.5 + 0.4 * np.sin(2 * np.pi * (across * rows + along * columns))
+    motion = Motion(amplitude=(0.0, 2.0))  # all columns are visible at the ends of the rows
+    frames = torch.from_numpy(take_frames(scene, TIMING, motion, 2, 0.005)).float()
+    ends = np.r_[:16, 304:320]
+    truth = crop(scene)[32:-32][:, ends]
+
+    def quality(**options):
+        restored = quietly(frames, TIMING, motion.vibration(), joint=joint, **options)
+        return -10 * np.log10(np.mean((restored[0].numpy()[32:-32][:, ends] - truth) ** 2))
+
+    assert quality() > 41
+    assert quality(regularisation=1e4) < 35
+
+
+@pytest.mark.parametrize(("rows", "count", "overlap"), [(211, 3, 24), (97, 2, 8), (1000, 7, 60), (101, 4, 0)])
+def test_windows_of_one_size_cover_all_rows(rows, count, overlap):
+    windows = row_windows(rows, count, overlap)
+    assert (windows[0].start, windows[-1].stop, len(windows)) == (0, rows, count)
+    sizes = {window.stop - window.start for window in windows}
+    assert len(sizes) == 1
+    shared = [before.stop - after.start for before, after in pairwise(windows)]
+    assert min(shared) >= 2 * overlap
+    assert sizes.pop() <= (rows + 2 * overlap * (count - 1)) / count + 1
+    values = torch.arange(rows * 6.0).reshape(rows, 2, 3)
+    parts = torch.stack([values[window] for window in windows], dim=-2)
+    parts[:overlap, :, 1:], parts[len(parts) - overlap :, :, :-1] = torch.nan, torch.nan  # too near to a border
+    assert torch.equal(join_windows(parts, windows), values)
+
+
+def smooth_prior(u):
+    """Correlation 0.9 of neighbouring rows at all frequencies (1, U), and innovations of variance 1."""
+    reflections = torch.stack([torch.full_like(u, 0.9), torch.zeros_like(u)])
+    return RowPrior(1 / (1 - reflections[0].square()), reflections, torch.zeros_like(u)[None])
+
+
+@pytest.mark.parametrize("first", [torch.arange(90) // 2 * 2, torch.arange(90).clamp(min=85) * 4 - 340])
+def test_observation_operator_is_a_sum_over_taps_and_has_this_adjoint(first):
+    generator = torch.Generator().manual_seed(3)
+    taps = torch.randn(1, 90, 6, 2, dtype=torch.float64, generator=generator)
+    along, middle = 0.3 * torch.randn(2, 1, 90, 2, dtype=torch.float64, generator=generator)
+    weight = torch.rand(1, 90, dtype=torch.float64, generator=generator)
+    weight[0, ::7] = 0
+    kernels = RowKernels(first[None], taps, middle[..., 0], along, weight)
+    part, length = slice(2, 13), 40
+    observation = Observation(kernels, 90, length, torch.float64)
+    u = torch.arange(part.start, part.stop, dtype=torch.float64) / length
+    data = torch.randn(1, 1, 2, 90, 11, dtype=torch.complex128, generator=generator)
+    coefficients = torch.randn(observation.count, 2, 1, 11, dtype=torch.complex128, generator=generator)
+    observed = observation.forward(coefficients, part)
+    turned = kernels.at(u)[0] * torch.exp(-2j * torch.pi * u * middle[0, :, :1])[:, None]
+    for row in (0, 8, 44, 89):
+        place = int(first[row]) - observation.top
+        expected = (turned[row, :, None] * coefficients[place : place + 6, :, 0]).sum(0)
+        torch.testing.assert_close(observed[0, 0, :, row], expected, rtol=1e-9, atol=1e-9)
+    back = observation.adjoint(data, part)
+    left = (weight[:, None, :, None] * observed.conj() * data).sum()
+    torch.testing.assert_close(left, (coefficients.conj() * back).sum(), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("reach", [0.0, 0.4, 1.4])
+def test_fast_path_agrees_with_the_plain_path(reach):
+    """The plain path is used where the precision requires its gradient."""
+    generator = torch.Generator().manual_seed(4)
+    rows, length = 60, 1200
+    taps = torch.rand(1, rows, 6, 2, dtype=torch.float64, generator=generator) / 6
+    along = torch.linspace(-reach, reach, 2, dtype=torch.float64).expand(1, rows, 2)
+    first = torch.arange(rows)[None] - 2
+    kernels = RowKernels(first, taps, torch.zeros(1, rows, dtype=torch.float64), along, torch.ones_like(first).double())
+    observation = Observation(kernels, rows, length, torch.float64)
+    u = torch.fft.rfftfreq(length, dtype=torch.float64)[None]
+    precision = smooth_prior(u).precision(0.01 * (1 + (10 * u).square()))
+    data = torch.randn(1, 1, 1, rows, length, dtype=torch.float64, generator=generator)
+    fast = SceneSolver(observation, precision, Partition(chunk=100)).fit(data)
+    plain = SceneSolver(observation, precision.clone().requires_grad_(), Partition(chunk=100)).fit(data)
+    assert plain.requires_grad
+    difference = (fast - plain.detach()).abs().square().mean().sqrt() / plain.detach().abs().square().mean().sqrt()
+    assert 1e-12 < difference < 1e-2  # interpolated, not factored: white noise is the least favourable data
+    repeated = SceneSolver(observation, precision, Partition(chunk=100), keep=True)
+    for _ in range(2):
+        torch.testing.assert_close(repeated.fit(data), plain.detach())

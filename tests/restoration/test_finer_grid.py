@@ -1,4 +1,4 @@
-"""Restoration on a grid of half pixels, against a camera that aliases and shares no code with the package."""
+"""Restoration on a grid of half pixels and sharpening, against a camera that aliases and shares no code."""
 
 import re
 import warnings
@@ -217,3 +217,64 @@ def test_strips_of_frames_with_roll_do_not_contradict_the_vibration(error):
         warnings.simplefilter("always", rsv.RestorationWarning)
         restored(frames, vibration, timing)
     assert any("not accurate enough" in str(warning.message) for warning in caught) == (error > 0)
+
+
+EDGE_SIZE, SIGMA = 80, 0.5
+
+
+def edge_frames_of(edge_scene):
+    return noisy(taken(edge_scene, 6, EDGE_SIZE), NOISE)
+
+
+def sharpened(edge_frames, optics, scale):
+    return rsv.restore(edge_frames, TIMING, VIBRATION, joint=True, scale=scale, check=False, optics=optics)[0]
+
+
+@pytest.fixture(scope="module")
+def edge_scene():
+    side = FINER * (EDGE_SIZE + 2 * MARGIN)
+    edge_scene = draw_scene(side, side, 5, blur=1.0)
+    y, x = (np.mgrid[0:side, 0:side] + 0.5) / FINER - (EDGE_SIZE + 2 * MARGIN) / 2
+    across = np.cos(0.1) * x + np.sin(0.1) * y  # an edge of 30 x 56 px, slanted by 0.1 rad
+    edge = 0.2 + 0.5 * np.clip(FINER * across + 0.5, 0, 1)
+    return closed(np.where((abs(x) < 15) & (abs(y) < 28), edge, edge_scene), 60)
+
+
+@pytest.fixture(scope="module")
+def edge_frames(edge_scene):
+    return edge_frames_of(after_optics(edge_scene, SIGMA))
+
+
+def test_a_sharper_camera_would_take_the_restored_image(edge_scene):
+    edge_frames = edge_frames_of(after_optics(edge_scene, 0.8))
+    target = still_image(after_optics(edge_scene, 0.5), (EDGE_SIZE, EDGE_SIZE), 1)
+    image = sharpened(edge_frames, rsv.Optics(sigma=0.8, pixel=1.0), 1)
+    blurred = sharpened(edge_frames, None, 1)
+    assert decibel(image, target, 12) > decibel(blurred, target, 12) + 5
+    assert float(image.mean()) == pytest.approx(float(blurred.mean()), abs=1e-4)
+
+
+def test_frequencies_that_the_camera_transmits_better_do_not_change(edge_frames):
+    sharp = sharpened(edge_frames[:2], rsv.Optics(sigma=0.2, pixel=1.0), 1)
+    assert torch.allclose(sharp, sharpened(edge_frames[:2], None, 1), atol=1e-6)
+
+
+def test_measured_mtf_and_fields_are_optics(edge_frames):
+    frequency = torch.linspace(0.02, 2.0, 100)
+    gaussian = torch.exp(-2 * (np.pi * SIGMA * frequency) ** 2)
+    expected = sharpened(edge_frames[:2], rsv.Optics(sigma=SIGMA, pixel=1.0), 2)
+    measured = sharpened(edge_frames[:2], rsv.Optics(mtf=(frequency, gaussian), pixel=1.0), 2)
+    assert torch.allclose(measured, expected, atol=4e-3)
+    assert torch.equal(sharpened(edge_frames[:2], {"sigma": SIGMA, "pixel": 1.0}, 2), expected)
+
+
+def test_mtf_beyond_a_still_camera(edge_scene, edge_frames):
+    part = (slice(EDGE_SIZE // 2 - 26, EDGE_SIZE // 2 + 26), slice(EDGE_SIZE // 2 - 14, EDGE_SIZE // 2 + 14))
+    finer = tuple(slice(2 * side.start, 2 * side.stop) for side in part)
+    still = rsv.slanted_edge_mtf(still_image(after_optics(edge_scene, SIGMA), (EDGE_SIZE, EDGE_SIZE))[part].copy())
+    plain = rsv.slanted_edge_mtf(sharpened(edge_frames, None, 2)[finer])
+    sharp = rsv.slanted_edge_mtf(sharpened(edge_frames, rsv.Optics(sigma=SIGMA, pixel=1.0), 2)[finer])
+    # from cycles per point to cycles per px; the paper improves the MTF of a vibrating camera by 20 to 75 %
+    assert 2 * float(plain.mtf50) == pytest.approx(float(still.mtf50), rel=0.04)
+    assert 2 * float(sharp.mtf50) > 1.4 * float(still.mtf50)
+    assert float(sharp.at(0.25)) > 2 * float(still.at(0.5))  # at the Nyquist frequency of the pixels

@@ -45,20 +45,6 @@ def test_frame_without_data_does_not_affect_joint_restoration():
     assert decibel(found, crop(SCENE)) > decibel(pair, crop(SCENE)) - 0.3
 
 
-def test_noise_level_of_frames_with_missing_columns():
-    frames = noisy_frames()
-    columns = frames.shape[-1] // 2
-    frames[..., :columns] = float("nan")
-    found = quietly(frames, camera(), MOTION.vibration())[..., columns:]
-    given_noise = quietly(frames, camera(), MOTION.vibration(), noise=NOISE)[..., columns:]
-    inner = crop(SCENE)[..., columns:]
-    assert decibel(found, inner) > decibel(given_noise, inner) - 0.15
-    assert (
-        decibel(quietly(frames, camera(), MOTION.vibration(), noise=1e-5)[..., columns:], inner)
-        < decibel(given_noise, inner) - 1
-    )
-
-
 @pytest.mark.parametrize(("value", "rows", "count"), [(0.0, 20, 1), (0.3, 200, 2)])
 def test_constant_frames_are_unchanged_without_a_warning(value, rows, count):
     frames = torch.full((count, 160, 140), value)

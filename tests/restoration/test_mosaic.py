@@ -70,12 +70,8 @@ def frames(clean):
     return raw(clean)
 
 
-@pytest.fixture(scope="module")
-def image(frames):
-    return restored(frames, scale=2)[0]
-
-
-def test_frames_together_contain_the_colours_that_each_lacks(scene, frames, image):
+def test_frames_together_contain_the_colours_that_each_lacks(scene, frames):
+    image = restored(frames, scale=2)[0]
     assert image.shape == (3, 2 * SIZE, 2 * SIZE)
     each = rsv.restore(opencv(frames), TIMING, VIBRATION, joint=True, check=False)[0]
     assert decibel(image[:, ::2, ::2], still(scene), 8) > decibel(each, still(scene), 8) + 6

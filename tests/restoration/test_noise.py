@@ -117,10 +117,6 @@ def fractal(steepness, optics, size=320, seed=5):
     return 0.5 + 0.15 * ndimage.gaussian_filter(texture / texture.std(), optics, mode="wrap")
 
 
-def with_noise(scene, level, seed=0):
-    return torch.from_numpy(scene + level * np.random.default_rng(seed).standard_normal(scene.shape)).float()
-
-
 def floor_of(image):
     return noise_floor(image).sqrt().item()
 
@@ -135,7 +131,8 @@ def test_floor_of_white_noise(shape, level):
     ("steepness", "level", "texture_adds"), [(1.0, 0.02, 1.2), (1.5, 0.005, 1.09), (1.5, 0.002, 1.4)]
 )
 def test_floor_is_below_texture(steepness, level, texture_adds):
-    image = with_noise(fractal(steepness, 0.5), level)
+    scene = fractal(steepness, 0.5)
+    image = torch.from_numpy(scene + level * np.random.default_rng(0).standard_normal(scene.shape)).float()
     assert estimate_noise(image).item() > texture_adds * level
     assert 0.6 * level < floor_of(image) < 0.5 * (level + estimate_noise(image).item())
 

@@ -4,7 +4,6 @@ import math
 import warnings
 from contextlib import suppress
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -244,22 +243,6 @@ def test_saturated_pixels_do_not_lower_the_noise_level():
     assert estimated > given - 0.5
 
 
-@pytest.mark.parametrize(
-    ("change", "error", "message"),
-    [
-        ({"vibration": SimpleNamespace(motion=None)}, TypeError, "of other results, pass .motion"),
-        ({"frames": torch.full((2, 16, 16), math.inf)}, ValueError, "frames must be finite"),
-        ({"ignore": torch.zeros(2, 16, 8, dtype=torch.bool)}, ValueError, "ignore must be a boolean mask of shape"),
-        ({"ignore": torch.ones(2, 16, 16, dtype=torch.bool)}, ValueError, "no pixel with data"),
-        ({"vibration": Vibration.still((3,))}, ValueError, r"vibration of batch shape \(3,\) does not fit"),
-        ({"vibration": Vibration(1.0, 5e7)}, ValueError, "periods while a row is exposed"),
-    ],
-)
-def test_bad_input(change, error, message):
-    arguments = {"frames": torch.rand(2, 16, 16), "timing": TIMING, "vibration": Vibration(1.0, 50.0)}
-    refuses(lambda: restore(**{**arguments, **change}), message, error)
-
-
 INVARIANT: dict[str, tuple[dict, dict]] = {  # options of every method, and one that must not change the result
     "exact": ({}, {"chunk_frequencies": 7}),
     "banded": ({}, {"chunk_rows": 7}),
@@ -283,25 +266,6 @@ def test_batch_channels_and_chunks_do_not_change_the_result(scene_and_frames, me
         )
     three = torch.stack([stack] * 3, 1)  # channels have one noise level
     torch.testing.assert_close(restore(three, TIMING, other, **common)[:, 1], restore(stack, TIMING, other, **common))
-
-
-@pytest.mark.parametrize("method", INVARIANT)
-@pytest.mark.parametrize(("scan_axis", "direction"), [(-2, "reverse"), (-1, "reverse")])
-def test_orientation(scene_and_frames, method, scan_axis, direction):
-    """The result for flipped or transposed frames is the flipped or transposed result."""
-    common = {"method": method, "check": False, **INVARIANT[method][0]}
-    frames = scene_and_frames[1][..., :96, :80]
-    expected = restore(frames, TIMING, Vibration(*PUSH_SCAN), **common)
-    axes = [[*values] for values in PUSH_SCAN]
-    if direction == "reverse":
-        axes[2][1] += math.pi
-        axes[3][1] *= -1
-        frames, expected = frames.flip(-2), expected.flip(-2)
-    if scan_axis == -1:
-        axes = [values[::-1] for values in axes]
-        frames, expected = frames.mT, expected.mT
-    timing = replace(TIMING, scan_axis=scan_axis, readout_direction=direction)
-    torch.testing.assert_close(restore(frames, timing, Vibration(*axes), **common), expected, rtol=0, atol=2e-5)
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ def folded(index, length):
     return np.minimum(index, 2 * length - 2 - index)
 
 
-def dense_operator(timing, motion, height, width, frame=0, samples=400):
+def dense_operator(timing, motion, height, width, frame=0, samples=100):
     """Matrix from spline coefficients to frame pixels, one by one; the exposure is a midpoint sum with many samples."""
     basis = BSpline.basis_element(np.arange(5) - 2.0, extrapolate=False)
     matrix = np.zeros((height, width, height, width))

@@ -53,9 +53,8 @@ def test_row_time_of_two_tones(two_tones):
     assert abs(found.frame_rows - FRAME_ROWS) < 4 * FRAME_ROWS * found.row_time_std / ROW_TIME
 
 
-@pytest.mark.parametrize("limits", [(2e-5, 5e-5), (3e-5, 5.5e-5)])
-def test_row_time_outside_the_limits_is_not_replaced_by_another(two_tones, limits):
-    found = rsv.calibrate_row_time_by_motion(two_tones, frame_rate=RATE, row_time=limits)
+def test_row_time_outside_the_limits_is_not_replaced_by_another(two_tones):
+    found = rsv.calibrate_row_time_by_motion(two_tones, frame_rate=RATE, row_time=(3e-5, 5.5e-5))
     assert not found.reliable
 
 
@@ -147,14 +146,6 @@ def test_smooth_motion_continues_over_the_blanking_time(highest, known):
         fit, _ = found
         assert not fit.others
         assert abs(fit.row_time - row_time) < 4 * fit.std < 0.02 * row_time
-
-
-@pytest.mark.parametrize(
-    ("limits", "message"), [((6e-5, 5e-5), "the first must be smaller"), ((20.0, 60.0), "in seconds")]
-)
-def test_bad_options(two_tones, limits, message):
-    with pytest.raises(ValueError, match=message):
-        rsv.calibrate_row_time_by_motion(two_tones, frame_rate=RATE, row_time=limits)
 
 
 def test_command(two_tones, one_tone, tmp_path, capsys):

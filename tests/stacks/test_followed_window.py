@@ -17,7 +17,7 @@ from rsvib_torch.stacks import read_manifest
 
 TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=12, frame_rows=500)
 CAMERA = ["--row-time", "100us", "--exposure", "1.2ms", "--frame-rate", "20"]
-FRAMES, DECAY = 40, 1.2  # s
+FRAMES, DECAY = 30, 1.2  # s
 AMPLITUDE, FREQUENCY = np.array([2.3, 1.7]), np.array([66.3, 47.0])  # px, Hz
 PHASE = np.array([0.5, 1.2])
 SCENE = draw_scene(208, 208, seed=2)
@@ -82,11 +82,11 @@ def test_each_frame_has_the_vibration_at_its_time(place):
     found = rsv.follow_vibration(frames, TIMING)
     assert found.vibration.amplitude.shape == (FRAMES, 2, 1)
     errors, reliable = errors_of(found, 0.0), found.reliable.numpy()
-    assert (reliable & (errors < 0.01)).all(1).sum() >= 36
+    assert (reliable & (errors < 0.01)).all(1).sum() >= FRAMES - 4
     assert not (reliable & (errors > 3 * found.std.displacement.numpy())).any()
     table = found.table()
     assert len(table["axis"]) == 2 * FRAMES
-    assert table["middle_time_s"][-1] == pytest.approx(39 * TIMING.frame_period + 0.5 * (127e-4 + 1.2e-3))
+    assert table["middle_time_s"][-1] == pytest.approx((FRAMES - 1) * TIMING.frame_period + 0.5 * (127e-4 + 1.2e-3))
     restored = rsv.restore(frames, TIMING, found, method="dewarp").numpy()
     assert min(decibel(restored[index], STILL) - decibel(frames[index], STILL) for index in range(0, 30, 5)) > 4
     refuses(lambda: rsv.restore(frames[:8], TIMING, found), "pass the frames that it was detected in")
@@ -155,19 +155,6 @@ def test_frequencies_of_a_sweep_are_within_their_standard_deviations():
     assert 0.2 < np.sqrt(np.square(z).mean()) < 1.2
 
 
-def test_a_batch_of_stacks_read_from_below_is_followed(place):
-    frames = np.load(place / "frames.npy")[:16]
-    turned = rsv.SensorTiming(1e-4, 12, 500, scan_axis="x", readout_direction="reverse")
-    batch = np.stack([frames[:, ::-1].transpose(0, 2, 1)[:, None]] * 2)
-    found = rsv.follow_vibration(batch, turned)
-    assert tuple(found.reliable.shape) == (2, 16, 2)
-    assert found.reliable.all()
-    amplitude = found.vibration.amplitude[1, 0].numpy().ravel()  # x across the rows
-    np.testing.assert_allclose(amplitude, AMPLITUDE[::-1] * np.exp(-0.007 / DECAY), rtol=0.02)
-    restored = rsv.restore(batch, turned, found, method="dewarp")[1, :, 0].numpy().transpose(0, 2, 1)[:, ::-1]
-    assert min(decibel(image, STILL) for image in restored) > 40
-
-
 def test_two_steady_tones_near_the_frame_rate_are_not_reliable_and_wrong():
     """Of frames that do not determine two tones of each axis, no frame is wrong."""
     sizes, hertz = np.array([[0.97, 0.94], [2.11, 0.57]]), np.array([[29.7, 48.4], [80.9, 72.8]])
@@ -185,13 +172,13 @@ def test_two_steady_tones_near_the_frame_rate_are_not_reliable_and_wrong():
 
 
 def test_windows_state_the_vibration_of_their_frames(place, tmp_path):
-    options = ("--window", 14, "--follow", "--out", tmp_path / "found")
+    options = ("--window", 14, "--follow", "--frames", "0:20", "--out", tmp_path / "found")
     assert rsvib("detect", place / "frames.npy", *CAMERA, *options) == 0
     manifest = read_manifest(tmp_path / "found" / "manifest.json")
-    assert len(manifest.detections()) == FRAMES
-    assert [frame for record in manifest.windows for frame in record.followed] == list(range(FRAMES))
+    assert len(manifest.detections()) == 20
+    assert [frame for record in manifest.windows for frame in record.followed] == list(range(20))
     table = manifest.table()
-    assert (table["first_frame"][-1], table["last_frame"][-1]) == (39, 39)
+    assert (table["first_frame"][-1], table["last_frame"][-1]) == (19, 19)
     assert table["middle_time_s"][-1] == pytest.approx(manifest.times()[-1])
     assert np.mean(table["reliable"]) > 0.9
 
@@ -236,15 +223,15 @@ def test_run_follows_a_vibration_that_changes_without_an_option(place, tmp_path,
         right += (reliable & (errors < 0.01)).all(1).sum()
         stds = np.array([one.std.displacement.numpy() for one in parts])
         wrong += (reliable & (errors > np.maximum(3 * stds, 0.01))).sum()
-    assert right >= 36
+    assert right >= FRAMES - 4
     assert wrong == 0
     rows = list(csv.DictReader((tmp_path / "run" / "tones.csv").read_text().splitlines()))
     sizes = [
         float(row["amplitude_px"]) for row in rows if row["axis"] == "x" and row["first_frame"] == row["last_frame"]
     ]
-    assert sizes[0] > 4 * sizes[-1]
+    assert sizes[0] > 3 * sizes[-1]
     restored = rsv.read_stack(tmp_path / "run" / "restored.tif").numpy()
-    assert sum(decibel(restored[index], STILL) > 40 for index in range(FRAMES)) >= 36
+    assert sum(decibel(restored[index], STILL) > 40 for index in range(FRAMES)) >= FRAMES - 4
     shown = ("--manifest", tmp_path / "run" / "manifest.json")
     assert rsvib("report", place / "frames.npy", tmp_path / "page", *CAMERA, *shown, "--method", "dewarp") == 0
     answer = " ".join(capsys.readouterr().out.split())

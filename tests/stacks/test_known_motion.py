@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from program import rsvib
-from truth import MARGIN, Motion, draw_scene, take_frames
+from truth import MARGIN, Curve, draw_scene, take_frames
 
 import rsvib_torch as rsv
 from rsvib_torch.stacks import align_stack, check_stack_motion
@@ -25,9 +25,9 @@ def recorded_path(clock):
     return np.stack([x, y], axis=-1)
 
 
-class Shaken(Motion):
-    def displacement(self, times):
-        return recorded_path(SPEED * times + CLOCK)
+@Curve
+def shaken(times):
+    return recorded_path(SPEED * times + CLOCK)
 
 
 @pytest.fixture(scope="module", name="place")
@@ -35,7 +35,7 @@ def make_place(tmp_path_factory):
     """A stack of 60 frames, and the recording, which is longer."""
     place = tmp_path_factory.mktemp("place")
     scene = draw_scene(HEIGHT + 2 * MARGIN, WIDTH + 2 * MARGIN, 7)
-    np.save(place / "frames.npy", take_frames(scene, TIMING, Shaken(), COUNT, 0.005).astype(np.float32))
+    np.save(place / "frames.npy", take_frames(scene, TIMING, shaken, COUNT, 0.005).astype(np.float32))
     clock = np.arange(811.9, 814.0, 1e-3)
     rows = [f"{t:.9f},{x:.9g},{y:.9g}" for t, (x, y) in zip(clock, recorded_path(clock), strict=True)]
     (place / "motion.csv").write_text("\n".join(["time,x,y", *rows]))

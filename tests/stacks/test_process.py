@@ -8,11 +8,11 @@ import pytest
 import tifffile
 import torch
 from small_stack import FRAMES, HEIGHT, MOTION, OPTIONS, STILL, TIMING, WIDTH, process_small, write_with_gaps
-from truth import decibel
+from truth import Motion, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
 from rsvib_torch.io import open_stack, write_stack
-from rsvib_torch.stacks import cut_windows, detect_stack, read_manifest
+from rsvib_torch.stacks import cut_windows, detect_stack, read_manifest, restore_trusted
 from rsvib_torch.stacks.memory import parse_memory
 
 
@@ -166,7 +166,8 @@ def test_stack_without_detection_leaves_no_files(tmp_path):
 
 def test_frame_times_of_the_file_are_used_and_kept(tmp_path):
     kept = [index for index in range(FRAMES) if index not in (3, 10, 11)]  # dropped frames
-    times = write_with_gaps(tmp_path, kept)
+    start = 100.25  # s
+    times = write_with_gaps(tmp_path, kept, start)
     for name in ("out.h5", "out.tif"):
         report = process_small(tmp_path / "frames.raw", tmp_path / name)
         info = rsv.read_stack_info(tmp_path / name)
@@ -178,7 +179,8 @@ def test_frame_times_of_the_file_are_used_and_kept(tmp_path):
     assert sorted(decibel(frame, STILL, 12) for frame in restored)[1] > 38  # also next to the gaps
     for record in records:
         found = record.detection.vibration
-        turn = 2 * np.pi * MOTION.frequency[0] * record.start_time + MOTION.phase[0] - float(found.phase[0, 0])
+        turn = 2 * np.pi * MOTION.frequency[0] * (record.start_time - start) + MOTION.phase[0]
+        turn -= float(found.phase[0, 0])
         assert abs(np.angle(np.exp(1j * turn))) < 0.2
         assert float(found.amplitude[0, 0]) == pytest.approx(MOTION.amplitude[0], rel=0.1)
 
@@ -215,3 +217,26 @@ def test_colour_and_axis_order_are_kept(whole, tmp_path):
     np.testing.assert_array_equal(np.load(tmp_path / "out.npy"), np.moveaxis(out, -1, 1))
     write_stack(tmp_path / "one.tif", torch.rand(2, 1, 8, 9), dtype="float32")
     assert tifffile.imread(tmp_path / "one.tif").size == 144
+
+
+@pytest.mark.parametrize("joint", [False, 3, True])
+def test_motions_are_undone_and_unchanged_frames_have_the_shape_of_restored_ones(joint):
+    """The frames as taken replace restored ones if nothing moves, or if these are worse; joint: the middle frame."""
+    timing, motion = rsv.SensorTiming(2e-5, 20, 256), Motion(amplitude=(2.0, 3.0), frequency=(120.0, 90.0))
+    frames = torch.from_numpy(take_frames(draw_scene(208, 208, 3), timing, motion, 3)).float()
+    frames[:, 20, 30] = torch.nan
+    vibration, options = motion.vibration(), {"joint": joint}
+    opposite = rsv.Vibration(vibration.amplitude, vibration.frequency, vibration.phase + torch.pi)
+    taken = frames[1:2] if joint is True else frames
+    for given, force, restored, outcome in (
+        (vibration, False, True, "helps"),
+        (opposite, False, False, "worse"),
+        (opposite, True, True, "worse"),
+        (rsv.Vibration.still(), True, False, None),
+    ):
+        found = restore_trusted(frames, timing, given, options, force=force)
+        assert found.restored == restored
+        assert (None if found.verdict is None else found.verdict.overall) == outcome
+        assert found.frames.shape == taken.shape
+        assert torch.equal(found.frames.nan_to_num(), taken.nan_to_num()) != restored
+    assert torch.isnan(found.frames).sum() == len(taken)

@@ -292,19 +292,6 @@ def test_a_frame_with_almost_no_detail_is_survived(steady):
     assert np.abs(errors(tracked[-1].detection)).max() < 0.004
 
 
-def test_columns_as_rows_and_the_reverse_readout(steady):
-    frames, tracked = steady
-    timing = replace(TIMING, scan_axis="x", readout_direction="reverse")
-    tracker = rsv.VibrationTracker(timing, columns=None)
-    for frame in frames[:10]:
-        turned = tracker.update(frame.mT.flip(-1))
-    other = tracked[9].detection.vibration
-    assert torch.allclose(turned.detection.vibration.frequency, other.frequency.flip(0))
-    assert torch.allclose(turned.restored.flip(-1).mT, tracked[9].restored, atol=1e-5)
-    change = turned.detection.vibration.phase[:, 0] - other.phase.flip(0)[:, 0]
-    assert torch.cos(change).numpy() == pytest.approx([-1.0, 1.0])  # x is the flipped axis
-
-
 def test_missing_pixels_and_channels(steady):
     frames, _ = steady
     tracker = rsv.VibrationTracker(TIMING, columns=None, channels="last")

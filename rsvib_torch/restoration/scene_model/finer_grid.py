@@ -194,7 +194,7 @@ class PolynomialPrior:
         # largest value: 1e3 lost 1.1 dB in soft scenes; 1e6 and single precision differ from double by -79 dB at most
         m, n = torch.meshgrid(*(torch.arange(_DEGREE + 1, device=u.device),) * 2, indexing="ij")
         a = self.coefficients * (noise_power.to(torch.float64) * strength / SCALE)
-        a = a.minimum(1e6 / _MAX_LAPLACIAN ** (m + n))
+        a = a.minimum(1e6 / _MAX_LAPLACIAN ** (m + n).double())
         a[0, 0] += 1e-5 / (1 + blur_reach)
         powers = _laplacian(u) ** torch.arange(_DEGREE + 1, device=u.device)[:, None, None]
         return torch.einsum("mn,nau->mau", a, powers) / _pixel(u)
