@@ -15,16 +15,7 @@ from rsvib_torch.frames.pixels import enlarged
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.report import plots
 from rsvib_torch.report.html import words
-from rsvib_torch.report.html.template import (
-    PERCENTILES,
-    BeforeAfter,
-    Blink,
-    Drawing,
-    before_after,
-    blink,
-    drawing,
-    write_page,
-)
+from rsvib_torch.report.html.template import PERCENTILES, Drawing, Pictures, drawing, pictures, write_page
 from rsvib_torch.report.html.words import Report
 from rsvib_torch.restoration import trusted_vibration
 from rsvib_torch.results.presentation import AXIS_NAMES, AXIS_UNITS
@@ -104,44 +95,24 @@ def measure_edges(before: Tensor, after: Tensor, boxes: Sequence[Box] | None = N
     return edges, notes
 
 
-def _details(before: Tensor, after: Tensor, names: tuple[str, ...]) -> list[BeforeAfter]:
-    """Crops at full resolution where the restored frame has the strongest detail.
-
-    If it is on a finer grid, the input is interpolated.
-    """
-    points = after.shape[-1] // before.shape[-1]
-    before = enlarged(before, points)
-    grey = _grey(after).float()
-    size = min(96 * points, *grey.shape)
-    pairs = []
-    for row, column in plots.detailed_places(grey, size, count=6, rim=16 * points):
-        crop = (..., slice(row, row + size), slice(column, column + size))
-        caption = _region(row // points, column // points, size // points, size // points)
-        caption += f"; {points} x {points} points per px, the input is interpolated" if points > 1 else ""
-        pairs.append(before_after(before[crop], after[crop], names=names, caption=caption, exact=True))
-    return pairs
-
-
-def whole_frame(report: Report, index: int, frames: tuple[Tensor, ...], names: tuple[str, ...]) -> BeforeAfter:
-    """One frame of the input, and the restored one beside it if there is one, with a part at full resolution."""
-    grey = _grey(frames[-1]).float()
-    place = plots.detailed_places(grey, min(96, *grey.shape), count=1, rim=16)[0]
-    pair = before_after(*frames, names=names, caption="", full_at=(place[0] + 48, place[1] + 48))
+def whole_frame(report: Report, index: int, frames: dict[str, Tensor]) -> Pictures:
+    """One frame of the input, and the restored one beside it if there is one, by name."""
+    shown = pictures({name: [frame] for name, frame in frames.items()})
+    grey = _grey(list(frames.values())[-1]).float()
+    ((row, column),) = plots.detailed_places(grey, min(96, *grey.shape), count=1, rim=16)
     caption = f"Frame {report.first + index}"
     if report.was_restored and len(report.restored) == 1:
         caption += ", and one image restored jointly from all frames"
-    if pair.scale < 1:
-        caption += f", reduced to {100 * pair.scale:.2g} %"
-    if pair.full is not None:
-        part = _region(pair.full.top, pair.full.left, pair.full.height, pair.full.width)
-        caption += f". The magnifier shows {part}"
-    (black, white), (low, high) = pair.levels, PERCENTILES
+    if shown.scale < 1:
+        caption += f", reduced to {100 * shown.scale:.2g} %"
+    (black, white), (low, high) = shown.levels, PERCENTILES
     levels = f"black is {black:.3f} and white {white:.3f} of full scale, the percentiles {low:g} and {high:g}"
     both = " of both images" if len(frames) > 1 else ""
-    return replace(pair, caption=f"{caption}. Grey levels are stretched: {levels}{both}.")
+    caption += f". Grey levels are stretched: {levels}{both}."
+    return replace(shown, caption=caption, place=(row + 48, column + 48))
 
 
-def frames_in_turn(report: Report, index: int, image_motion: Tensor) -> Blink | None:
+def frames_in_turn(report: Report, index: int, image_motion: Tensor) -> Pictures | None:
     """Two consecutive frames before and after restoration, at full resolution where detail is strongest.
 
     Uniform motion along the image is compensated by whole px, the same for input and restored frames, so that the
@@ -151,9 +122,9 @@ def frames_in_turn(report: Report, index: int, image_motion: Tensor) -> Blink | 
     if count < 2:
         return None
     first = min(index, count - 2)
-    frames, names = [report.frames], ["input"]
+    frames = {"input": report.frames}
     if report.was_restored and len(report.restored) == count:
-        frames, names = [report.frames, report.restored], ["input", "restored"]
+        frames["restored"] = report.restored
     starts = report.timing.frame_starts(count)
     moved = (image_motion * float(starts[first + 1] - starts[first])).round().int().tolist()
     height, width = report.frames.shape[-2:]
@@ -162,14 +133,16 @@ def frames_in_turn(report: Report, index: int, image_motion: Tensor) -> Blink | 
         return None
     top, left = max(0, -moved[1]), max(0, -moved[0])  # of the part of the first frame that both contain
     size = min(480, rows, columns)  # px
-    common = _grey(frames[-1][first])[top : top + rows, left : left + columns]
+    common = _grey(list(frames.values())[-1][first])[top : top + rows, left : left + columns]
     row, column = plots.detailed_places(common.float(), size, count=1, rim=16)[0]
     row, column = row + top, column + left
 
     def part(frame: Tensor, down: int, right: int) -> Tensor:
         return frame[..., row + down : row + down + size, column + right : column + right + size]
 
-    pairs = [(part(stack[first], 0, 0), part(stack[first + 1], moved[1], moved[0])) for stack in frames]
+    pairs = {
+        name: (part(stack[first], 0, 0), part(stack[first + 1], moved[1], moved[0])) for name, stack in frames.items()
+    }
     number = report.first + first
     caption = f"Frames {number} and {number + 1}, {_region(row, column, size, size)}."
     if any(moved):
@@ -178,7 +151,7 @@ def frames_in_turn(report: Report, index: int, image_motion: Tensor) -> Blink | 
     if len(frames) > 1:
         caption += " The motion between the input frames is the vibration"
         caption += "; it is absent from the restored frames where restoration is right."
-    return blink(pairs, names=names, frames=(number, number + 1), caption=caption)
+    return replace(pictures(pairs), caption=caption, frames=(number, number + 1))
 
 
 def _figures_of(report: Report, result: DetectionResult, removed: Vibration) -> dict[str, Drawing]:
@@ -200,41 +173,39 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
 
     ``edges`` are positions of slanted edges in the frame on the page; None searches for them.
     """
-    result, timing = report.detection, report.timing
+    result, timing, windows, restored = report.detection, report.timing, report.windows, report.was_restored
     points, finer = report.restored.shape[-1] // report.frames.shape[-1], report.restored
     report = replace(report, restored=finer[..., ::points, ::points])
     index = len(report.frames) // 2 if len(report.restored) < len(report.frames) else 0
-    before = report.frames[index]
     last = min(index, len(report.restored) - 1)
-    after = report.restored[last] if report.was_restored else None
-    detail = finer[last] if report.was_restored else before
-    shown = (before,) if after is None else (before, after)
-    names = ("input", "restored")[: len(shown)]
-    measured, notes = measure_edges(_grey(before), _grey(detail), edges)
+    frames = {"input": report.frames[index]}
+    detail = report.frames[index]
     figures: dict[str, Drawing] = {}
-    detected: Table = {"tried": [], "residuals": []}
+    if restored:
+        frames["restored"], detail = report.restored[last], finer[last]
+        compared = (frame.nan_to_num(0.0) for frame in (enlarged(frames["input"], points), detail))
+        figures["details"] = drawing(plots.comparison_figure(*compared, size=96 * points))
+    measured, notes = measure_edges(_grey(frames["input"]), _grey(detail), edges)
     for direction in sorted({edge.direction for edge in measured}):
         chosen = [edge for edge in measured if edge.direction == direction]
         curves = [[one.before for one in chosen if one.before is not None], [one.after for one in chosen]]
-        of_names = dict(zip(names, curves, strict=False))
-        figures[f"mtf_{direction}"] = drawing(plots.mtf_figure(of_names, points={names[-1]: points}))
-    restored = report.was_restored
-    shape = report.frames.shape
+        of_names = dict(zip(frames, curves, strict=False))
+        figures[f"mtf_{direction}"] = drawing(plots.mtf_figure(of_names, points={list(frames)[-1]: points}))
+    shape: Sequence[int] = report.frames.shape
+    detected: Table = {"residuals": []}
     if result is None:
-        assert report.windows is not None
-        totals, followed = report.windows.totals(), report.windows.followed()
+        assert windows is not None
+        totals, followed = windows.totals(), windows.followed()
         mark = "good" if totals["outcomes"].get("helps") == totals["windows"] else "doubt"
-        sentences, shape = [words.FOLLOWED], report.windows.input["shape"]
+        sentences, shape = [words.FOLLOWED], windows.input["shape"]
         motion = torch.zeros(2) if followed is None else followed.vibration.image_motion[report.first]
     else:
         removed = trusted_vibration(result, timing, len(report.frames), report.num_rows)[0].to("cpu")
         motion = removed.image_motion
         sentences = words.verdict_sentences(report, result, removed)
-        if not restored and report.windows is not None and report.windows.totals()["restored"]:
+        if not restored and windows is not None and windows.totals()["restored"]:
             sentences[0] = words.WINDOWS_RESTORED
         mark = words.overall_result(report, result)[0]
-        if not restored:
-            detected["tried"] = words.tried_sentences(report, result, sentences[1:])
         figures |= _figures_of(report, result, removed)
         detected["residuals"] = [
             (name, f"{float(result.residual[axis]):.3g} {AXIS_UNITS[axis]}")
@@ -242,25 +213,25 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
         ]
         detected["tones"] = words.detected_tones(result)
         detected["at_centre"] = " at the centre of the frame" if removed.num_axes > 2 else ""
-    windows = None
-    if report.windows is not None:
-        vibration, restoration = report.windows.lines()
-        lines = [*vibration[1:], *(restoration if report.windows.output is not None else [])]
-        windows = {"lines": lines, "table": report.windows.tone_table()}
-        if report.windows.gyroscope is None:  # no tones are searched for otherwise
-            figures["windows"] = drawing(report.windows.plot())
+    lines: list[str] = []
+    if windows is not None:
+        vibration, restoration = windows.lines()
+        lines = [*vibration[1:], *(restoration if windows.output is not None else [])]
+        if windows.gyroscope is None:  # no tones are searched for otherwise
+            figures["windows"] = drawing(windows.plot())
     content = {
         "report": report,
         "mark": mark,
-        "verdict": sentences if restored else sentences[:1],
+        "verdict": sentences,
         **detected,
         "frames_title": "Input and restored frame" if restored else "Input frame",
-        "overview": whole_frame(report, index, shown, names),
+        "overview": whole_frame(report, index, frames),
         "blink": frames_in_turn(report, index, motion),
-        "details": [] if after is None else _details(before, detail, names),
+        "finer": f", which have {points} x {points} points per px" if points > 1 else "",
         "figures": figures,
-        "windows": windows,
-        "mtf_head": ["edge", "direction", "angle", *(f"MTF50 of the {name} frame (cycles/px)" for name in names)],
+        "windows": lines,
+        "window_tones": None if windows is None else windows.tone_table(),
+        "mtf_head": ["edge", "direction", "angle", *(f"MTF50 of the {name} frame (cycles/px)" for name in frames)],
         "mtf_rows": [edge.row(restored) for edge in measured],
         "mtf_notes": notes,
         "camera": words.camera_rows(timing, shape),

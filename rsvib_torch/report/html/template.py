@@ -1,15 +1,12 @@
 """Self-contained HTML pages: images as data URIs, and templates that escape all text."""
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import jinja2
 import numpy as np
-from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
@@ -20,12 +17,11 @@ from rsvib_torch.report.plots import picture
 from rsvib_torch.results.result_files import figure_png
 from rsvib_torch.text import data_uri
 
-GreyLevels = tuple[float, float]  # values that are drawn black and white, full scale 1
 PERCENTILES = (0.2, 99.8)  # of the values of the images; few saturated or dead pixels do not reduce the contrast
-# Compression of the images that can be magnified. Size of a frame of 2048² px (noise 0.003) on the page, rms error in
-# grey levels: grey 2.2 MB, 1.4; colour 2.7 MB, 1.7. With quality 85: 1.2 MB, 2.4 and 2.9. As PNG: 3.7 MB, 11 MB.
+# Compression of the images. Size of a frame of 2048² px (noise 0.003) on the page, rms error in grey levels: grey
+# 2.2 MB, 1.4; colour 2.7 MB, 1.7. With quality 85: 1.2 MB, 2.4 and 2.9. As PNG: 3.7 MB, 11 MB.
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
-_FULL_PIXELS = 2048 * 2048  # a larger frame is reduced, and its part of this size is added at full resolution
+_MOST_PIXELS = 4096 * 4096  # a larger frame is reduced
 
 
 @dataclass(frozen=True)
@@ -38,32 +34,17 @@ class Drawing:
 
 
 @dataclass(frozen=True)
-class BeforeAfter:
-    """Two images of the same part of a frame, or one."""
+class Pictures:
+    """Images of one part of frames in panels: one each that a divider separates, or two each that are shown in turn."""
 
-    images: tuple[str, ...]  # data URIs of the image before, and after if there is one
-    names: tuple[str, ...]  # their titles
-    caption: str  # description
-    width: int  # width of either image in px
-    height: int  # height of either image in px
-    levels: GreyLevels  # values that are drawn black and white
-    left: int = 0  # column of the frame at the left edge
-    top: int = 0  # row of the frame at the upper edge
-    scale: float = 1.0  # pixels of the image per pixel of the frame, 1 or less
-    full: "BeforeAfter | None" = None  # a part of the frame at full resolution; None where ``scale`` is 1
-    # row and column of the frame that the magnifier shows first; None for its centre
-    place: tuple[int, int] | None = None
-
-
-@dataclass(frozen=True)
-class Blink:
-    """Two consecutive frames for each of several panels, which a page shows in turn."""
-
-    panels: tuple[tuple[str, tuple[str, str]], ...]  # title of each panel, and data URIs of its two images
-    frames: tuple[int, int]  # numbers of the two frames
-    caption: str  # description
+    panels: tuple[tuple[str, tuple[str, ...]], ...]  # title of each panel, and data URIs of its images
     width: int  # width of the images in px
     height: int  # height of the images in px
+    levels: tuple[float, float]  # values that are drawn black and white, full scale 1
+    scale: float  # pixels of the images per pixel of the frame, 1 or less
+    caption: str = ""  # description
+    place: tuple[int, int] = (0, 0)  # row and column of the frame that the magnifier shows first
+    frames: tuple[int, int] = (0, 0)  # numbers of the frames that are shown in turn
 
 
 def drawing(figure: Figure) -> Drawing:
@@ -72,92 +53,35 @@ def drawing(figure: Figure) -> Drawing:
     return Drawing(png, data_uri(png, "image/png"), round(100 * figure.get_figwidth()))
 
 
-def _pixels(image: Tensor, longest: int | None = None) -> NDArray[np.float32]:
-    """Image (H, W) or (C, H, W) as OpenCV has it, reduced by averaging if a side exceeds ``longest``."""
+def pictures(panels: Mapping[str, Sequence[Tensor]], *, most_pixels: int = _MOST_PIXELS) -> Pictures:
+    """Encode images (H, W) or (C, H, W) of one shape with the same grey scale, reduced if they have too many pixels."""
+    pixels = {name: [_pixels(image, most_pixels) for image in images] for name, images in panels.items()}
+    first = next(iter(pixels.values()))[0]
+    values = np.concatenate([image[np.isfinite(image)] for images in pixels.values() for image in images])
+    low, high = np.percentile(values, PERCENTILES) if len(values) else (0.0, 1.0)
+    encoded = tuple((name, tuple(_encoded(image, low, high) for image in images)) for name, images in pixels.items())
+    height, width = first.shape[:2]
+    return Pictures(encoded, width, height, (float(low), float(high)), width / next(iter(panels.values()))[0].shape[-1])
+
+
+def _pixels(image: Tensor, most: int) -> NDArray[np.float32]:
+    """Image as OpenCV has it, reduced by averaging to ``most`` pixels."""
     pixels: NDArray[np.float32] = picture(image).flip(-1).numpy()  # OpenCV: blue, green, red
     height, width = pixels.shape[:2]
-    scale = 1.0 if longest is None else longest / max(height, width)
+    scale = (most / (height * width)) ** 0.5
     if scale < 1:
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
         pixels = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.float32)
     return pixels
 
 
-def _grey_levels(images: Sequence[NDArray[np.float32]]) -> GreyLevels:
-    """``PERCENTILES`` of the values of images that are not missing."""
-    values = np.concatenate([image[np.isfinite(image)] for image in images])
-    low, high = np.percentile(values, PERCENTILES) if len(values) else (0.0, 1.0)
-    return float(low), float(high)
-
-
-def _encoded(pixels: NDArray[np.float32], levels: GreyLevels, exact: bool) -> str:
-    """Data URI of an image: PNG if ``exact``, else JPEG."""
-    low, high = levels
+def _encoded(pixels: NDArray[np.float32], low: float, high: float) -> str:
+    """Data URI of an image as JPEG."""
     grey_levels = np.nan_to_num((pixels - low) / max(high - low, 1e-6)).clip(0, 1) * 255
-    kind = "png" if exact else "jpeg"
-    encoded, content = cv2.imencode(f".{kind}", grey_levels.round().astype(np.uint8), () if exact else _JPEG)
+    encoded, content = cv2.imencode(".jpeg", grey_levels.round().astype(np.uint8), _JPEG)
     if not encoded:
         raise ValueError(f"OpenCV cannot encode an image of shape {pixels.shape}")
-    return data_uri(content.tobytes(), f"image/{kind}")
-
-
-def before_after(
-    *images: Tensor,
-    names: tuple[str, ...],
-    caption: str,
-    longest: int = 1600,
-    exact: bool = False,
-    full_at: tuple[int, int] | None = None,
-) -> BeforeAfter:
-    """Encode two images (H, W) or (C, H, W) of one shape, or one, with the same grey scale.
-
-    Images with a side above ``longest`` px are reduced by averaging; around the row and column ``full_at`` they are
-    kept at full resolution beside the reduced ones, and not reduced at all up to 2048² px. ``exact``: PNG, not JPEG.
-    """
-    height, width = images[0].shape[-2:]
-    if full_at is not None and height * width <= _FULL_PIXELS:
-        longest = max(height, width)
-    reduced = [_pixels(image, longest) for image in images]
-    levels, full = _grey_levels(reduced), None
-
-    def pair(pixels: Sequence[NDArray[np.float32]], text: str = "", **place: Any) -> BeforeAfter:
-        uris = tuple(_encoded(image, levels, exact) for image in pixels)
-        return BeforeAfter(uris, names, text, pixels[0].shape[1], pixels[0].shape[0], levels, **place)
-
-    if full_at is not None and longest < max(height, width):
-        columns = min(width, max(2048, _FULL_PIXELS // height))
-        rows = min(height, _FULL_PIXELS // columns)
-        top, left = (
-            min(max(0, place - size // 2), whole - size)
-            for place, size, whole in zip(full_at, (rows, columns), (height, width), strict=True)
-        )
-        parts = [_pixels(image[..., top : top + rows, left : left + columns]) for image in images]
-        full = pair(parts, left=left, top=top)
-    return pair(reduced, caption, scale=reduced[0].shape[1] / width, full=full, place=full_at)
-
-
-def blink(
-    stacks: Sequence[tuple[Tensor, Tensor]], *, names: Sequence[str], frames: tuple[int, int], caption: str
-) -> Blink:
-    """Encode two consecutive frames (H, W) or (C, H, W) for each panel with the same grey scale."""
-    pixels = [[_pixels(image) for image in pair] for pair in stacks]
-    levels = _grey_levels([image for pair in pixels for image in pair])
-    encoded = [(_encoded(first, levels, False), _encoded(second, levels, False)) for first, second in pixels]
-    height, width = pixels[0][0].shape[:2]
-    return Blink(tuple(zip(names, encoded, strict=True)), frames, caption, width, height)
-
-
-def _explained(text: str, terms: Mapping[str, str]) -> Markup:
-    """HTML of a text in which terms refer to their explanations, which the page lists."""
-    if not terms:
-        return escape(text)
-    pattern = re.compile(rf"\b({'|'.join(map(re.escape, sorted(terms, key=len, reverse=True)))})\b")
-    parts = pattern.split(text)  # texts and terms in turn
-    reference = Markup('<span class="term" tabindex="0" aria-describedby="term-{}">{}</span>')
-    return Markup().join(
-        reference.format(part.replace(" ", "-"), part) if index % 2 else escape(part)
-        for index, part in enumerate(parts)
-    )
+    return data_uri(content.tobytes(), "image/jpeg")
 
 
 def write_page(path: Path, content: Table) -> None:
@@ -169,7 +93,6 @@ def write_page(path: Path, content: Table) -> None:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["explained"] = _explained
     text = environment.get_template("report.html").render(**content)
     with whole_file(path) as part:
         part.write_text(text, encoding="utf-8")

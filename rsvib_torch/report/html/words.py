@@ -21,8 +21,7 @@ from rsvib_torch.text import measured_text
 
 Mark = Literal["good", "doubt", "bad"]
 _QUANTITIES = ("amplitude", "frequency", "period", "phase")
-# Terms that the page explains, in the order of its list; a head or first cell of a table with this text, up to a
-# parenthesis, has the explanation as a tooltip.
+# Terms that the page explains, in the order of its list
 TERMS = {
     "displacement": "Distance in px by which the vibration moves the content of a row in the image; positive towards "
     "larger x and y.",
@@ -142,22 +141,6 @@ def verdict_sentences(report: Report, result: DetectionResult, removed: Vibratio
     elif report.was_restored:
         sentences.append("No two frames have enough of the scene in common to judge the restoration.")
     return sentences
-
-
-def tried_sentences(report: Report, result: DetectionResult, found: Sequence[str]) -> list[str]:
-    """What was tried where no frame was restored: the detection, its findings ``found``, and the restoration."""
-    curve = result.offsets
-    pairs, rows = curve.offsets.shape[-3:-1]
-    measured = f"{100 * float(curve.good.double().mean()):.0f} %"
-    sentences = [
-        f"Offsets were measured at {rows} rows of {pairs} {'pair' if pairs == 1 else 'pairs'} of frames ({measured} of "
-        "them successfully), and sinusoids were fitted to them along both axes.",
-        *found,
-    ]
-    if report.verdict is None:
-        return [*sentences, "Frames were not restored, because along no axis a vibration is known accurately enough."]
-    chosen = _chosen(report)
-    return [*sentences, f"Frames were restored{f' with {chosen}' * bool(chosen)} and judged; they are not written."]
 
 
 def about_rows(report: Report) -> list[list[str]]:
