@@ -1,9 +1,10 @@
 """The camera of the tests, benchmarks and the reproduction, compared with the integral of analytic waves."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from benchmarks.independent_camera import Shake, take_frames
-from benchmarks.reproduction import GlobalShutter
 
 TONES = ([[1.3, 0.4], [2.1, 0.0]], [[50.0, 120.0], [30.0, 0.0]], [[0.4, 1.0], [1.3, 0.0]])
 IMAGE_MOTION = (40.0, -30.0)
@@ -28,7 +29,8 @@ def test_frames_equal_the_integral_of_a_wave(wave, options, row_time, exposure):
     along, across = np.cos(turn[0] * np.arange(whole[1])), np.cos(turn[1] * (np.arange(whole[0]) + 0.5))
     scene = 0.5 + 0.3 * across[:, None] * along
     shake = Shake(*(np.array(values) for values in TONES), np.array(IMAGE_MOTION))
-    frames = take_frames(scene, shake, GlobalShutter(row_time, exposure, PERIOD), 2, size, **options)
+    timing = SimpleNamespace(row_time=row_time, exposure_time=exposure, frame_period=PERIOD)
+    frames = take_frames(scene, shake, timing, 2, size, **options)
     assert frames.shape == (2, *size)
     rows, columns = np.arange(size[0]), np.arange(size[1])
     for p, frame in enumerate(frames):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from benchmark import parsed
 from benchmarks import reproduction
-from benchmarks.reproduction import AMPLITUDE, DETECTED, PERIOD, RESTORED, crossing, straight_edge_mtf
+from benchmarks.reproduction import AMPLITUDE, DETECTED, PERIOD, crossing, straight_edge_mtf
 from edge_truth import draw_edge, gaussian, through_pixels
 
 
@@ -29,10 +29,6 @@ def test_percentages_of_the_paper_agree_with_its_values():
         for axis, line in lines.items():
             assert line.period_error == pytest.approx(100 * abs(line.period / PERIOD[axis] - 1), abs=0.015)
             assert line.amplitude_error == pytest.approx(100 * abs(line.amplitude / AMPLITUDE[axis] - 1), abs=0.015)
-    for lines in RESTORED.values():
-        for line in lines.values():
-            for before, after, gain in zip(line.degraded, line.restored, line.improvement, strict=True):
-                assert gain == pytest.approx(100 * (after / before - 1), abs=0.05)
 
 
 def test_small_run():
@@ -45,9 +41,7 @@ def test_small_run():
         of_target = reproduction.chosen(results, target=target, part="restoration")
         for method, least, most in ((reproduction.DEGRADED, 0, 20), (reproduction.DEFAULT, 36, 60)):
             assert all(least < row["psnr"] < most for row in reproduction.chosen(of_target, method=method))
-    aliases = {row["axis"]: row["found"] for row in reproduction.chosen(results, part="shutter")}
-    assert aliases == pytest.approx({"x": 2.409, "y": 6.205}, abs=0.02)  # 50, 30 Hz less multiples of 23.795 Hz
     text = "\n".join(reproduction.lines(results, options))
     assert len(reproduction.detection_cells(results)) == 12
-    assert len(reproduction.restoration_cells(results)) == 24
+    assert len(reproduction.restoration_cells(results)) == 12
     assert "nan" not in text
