@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from matplotlib.figure import Figure
 from rich.console import Console
 from torch import Tensor
 
@@ -26,7 +25,6 @@ from rsvib_torch.commands.terminal import warnings_in_one_line, working
 from rsvib_torch.datasets import city_and_fields, resolution_chart
 from rsvib_torch.files.atomic import whole_folder
 from rsvib_torch.report import Report, write_report_page
-from rsvib_torch.report.plots import detailed_places, save_figure
 from rsvib_torch.text import text_table
 
 TIMING = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
@@ -70,30 +68,6 @@ def show(console: Console, name: str, lines: list[dict[str, Any]], quality: dict
     console.print(f"{name}: frames\n{text_table(heads, cells)}\n")
 
 
-def before_after(frame: Tensor, restored: Tensor, still: Tensor) -> Figure:
-    """Draw the stretched middle columns, a detail, and its difference from the truth, before and after restoration."""
-    middle, strip, size = frame.shape[-1] // 2, 40, 160
-    places = detailed_places(still[2 * RIM : -2 * RIM, 2 * RIM : -2 * RIM], size, 1)
-    row, column = (place + 2 * RIM for place in places[0])
-    detail = (slice(row, row + size), slice(column, column + size))
-    figure = Figure(figsize=(12.0, 8.4), layout="constrained")
-    panels = figure.subplots(2, 3)
-    for line, (name, image) in enumerate((("input", frame), ("restored", restored))):
-        error = (image - still)[RIM:-RIM, RIM:-RIM]
-        shown = (
-            (image[:, middle - strip : middle + strip], f"{name}: middle columns, stretched", {"aspect": "auto"}),
-            (image[detail], f"{name}: detail", {}),
-            ((image - still)[detail], "difference from the scene at rest", {"vmin": -0.3, "vmax": 0.3}),
-        )
-        for panel, (part, title, options) in zip(panels[line], shown, strict=True):
-            panel.imshow(part.numpy(), cmap="gray", interpolation="nearest", **{"vmin": 0.0, "vmax": 1.0, **options})
-            panel.set_title(title, loc="left", fontsize=11)
-            panel.set_xticks([])
-            panel.set_yticks([])
-        panels[line, 2].set_xlabel(f"whole frame: rms {error.square().mean().sqrt():.4f} of full scale", fontsize=11)
-    return figure
-
-
 def run(name: str, options: argparse.Namespace, arguments: Sequence[str], console: Console) -> None:
     """Simulate, detect, restore and evaluate one scene, and write all results to a folder of its name."""
     size, out = (2048, 320 if options.quick else 2048), options.out / name
@@ -121,7 +95,7 @@ def run(name: str, options: argparse.Namespace, arguments: Sequence[str], consol
         rsv.write_stack(folder / "frames.tif", frames, dtype="uint16", full_scale=FULL_SCALE)
         rsv.write_stack(folder / "restored.tif", restored, dtype="uint16", full_scale=FULL_SCALE)
         write_detection(folder, detection, TIMING)
-        save_figure(before_after(frames[0], restored[0], still), folder / "before_after.png", dpi=80)
+        rsv.save_figure(rsv.comparison_figure(frames[0], restored[0]), folder / "before_after.png", dpi=80)
         (folder / "report").mkdir()
         report = Report(
             title=f"Demonstration: {name}",

@@ -126,32 +126,30 @@ def frames_in_turn(report: Report, index: int, image_motion: Tensor) -> Pictures
     if report.was_restored and len(report.restored) == count:
         frames["restored"] = report.restored
     starts = report.timing.frame_starts(count)
-    moved = (image_motion * float(starts[first + 1] - starts[first])).round().int().tolist()
+    right, down = (image_motion * float(starts[first + 1] - starts[first])).round().int().tolist()
     height, width = report.frames.shape[-2:]
-    rows, columns = (max(0, length - abs(step)) for length, step in ((height, moved[1]), (width, moved[0])))
-    if min(rows, columns) < 32:  # px; the two frames have too little in common
+    if min(height - abs(down), width - abs(right)) < 32:  # px; the two frames have too little in common
         return None
-    top, left = max(0, -moved[1]), max(0, -moved[0])  # of the part of the first frame that both contain
-    size = min(480, rows, columns)  # px
-    common = _grey(list(frames.values())[-1][first])[top : top + rows, left : left + columns]
-    row, column = plots.detailed_places(common.float(), size, count=1, rim=16)[0]
-    row, column = row + top, column + left
-
-    def part(frame: Tensor, down: int, right: int) -> Tensor:
-        return frame[..., row + down : row + down + size, column + right : column + right + size]
-
+    top, left = max(0, -down), max(0, -right)  # of the part of the first frame that both contain
+    inner = (..., slice(top, height - max(0, down)), slice(left, width - max(0, right)))
     pairs = {
-        name: (part(stack[first], 0, 0), part(stack[first + 1], moved[1], moved[0])) for name, stack in frames.items()
+        name: (stack[first][inner], stack[first + 1].roll((-down, -right), (-2, -1))[inner])
+        for name, stack in frames.items()
     }
+    grey = _grey(list(pairs.values())[-1][0]).float()
+    size = min(480, *grey.shape)  # px
+    row, column = plots.detailed_places(grey, size, count=1, rim=16)[0]
+    part = (..., slice(row, row + size), slice(column, column + size))
+    parts = {name: [image[part] for image in pair] for name, pair in pairs.items()}
     number = report.first + first
-    caption = f"Frames {number} and {number + 1}, {_region(row, column, size, size)}."
-    if any(moved):
-        shift = f"{-moved[0]} px along x and {-moved[1]} px along y"
+    caption = f"Frames {number} and {number + 1}, {_region(row + top, column + left, size, size)}."
+    if right or down:
+        shift = f"{-right} px along x and {-down} px along y"
         caption += f" Frame {number + 1} is moved by {shift}, the uniform motion."
     if len(frames) > 1:
         caption += " The motion between the input frames is the vibration"
         caption += "; it is absent from the restored frames where restoration is right."
-    return replace(pictures(pairs), caption=caption, frames=(number, number + 1))
+    return replace(pictures(parts), caption=caption, frames=(number, number + 1))
 
 
 def _figures_of(report: Report, result: DetectionResult, removed: Vibration) -> dict[str, Drawing]:
