@@ -165,44 +165,37 @@ def posterior(matrix: Tensor, right: Tensor, roots: Tensor, contrast: Tensor) ->
     """
     edge, rest = slice(None, _EDGE), slice(_EDGE, None)
     strength = matrix.new_tensor(_STRENGTHS).square()[:, None]
-    solutions = []
-    for shading in _SHADINGS:
-        # elimination of edge and sides, with the prior of the slopes
-        normal = matrix[edge, edge].clone()
-        normal[_SLOPES, _SLOPES] += (shading * contrast) ** -2
-        size = normal.diagonal().sqrt()
-        size = size.clamp(min=1e-12 * float(matrix.diagonal()[edge].max()) ** 0.5)
-        normal = normal / size / size[:, None]
-        normal.diagonal().add_(1e-13)
-        factor = torch.linalg.cholesky(normal)
-        follow = -torch.cholesky_solve(matrix[edge, rest] / size[:, None], factor) / size[:, None]
-        start = torch.cholesky_solve((right[edge] / size)[:, None], factor)[:, 0] / size
-        gram = matrix[rest, rest] + matrix[rest, edge] @ follow
-        evidence = 0.5 * right[edge] @ start - (factor.diagonal() * size).log().sum() - 2 * (shading * contrast).log()
-        # modes of tail and splines, which all strengths have in common
-        values, vectors = torch.linalg.eigh(roots.mT @ gram @ roots)
-        values, modes = values.clamp(min=0.0)[:, None], roots @ vectors
-        projected = (modes.mT @ (right[rest] - matrix[rest, edge] @ start))[:, None]
-        shrunk = strength / (1 + strength * values)  # variances (P, strengths, 1 + K) of the modes
-        evidence = evidence + 0.5 * (shrunk * projected.square() - torch.log1p(strength * values)).sum(-1)
-        free = torch.linalg.inv(factor).T / size[:, None]  # square root of the covariance of edge and sides alone
-        solutions.append((evidence, modes, shrunk, shrunk * projected, start, follow, free))
-    best = torch.stack([evidence.max() for evidence, *_ in solutions]).max()
-    weights, parameters, spreads = [], [], []
-    used = torch.zeros(len(roots), dtype=torch.bool, device=roots.device)
-    for evidence, modes, shrunk, mean, start, follow, free in solutions:
-        weight = torch.exp(evidence - best)
-        kept = weight > 1e-3
-        used |= kept.any(1)
-        weights.append(weight[kept])
-        chosen = modes[kept.nonzero()[:, 0]]
-        departure = (chosen @ mean[kept][..., None])[..., 0]
-        parameters.append(torch.cat([start + departure @ follow.T, departure], dim=1))
-        root = chosen * shrunk[kept].sqrt()[:, None]
-        of_edge = torch.cat([follow @ root, free.expand(len(root), -1, -1)], dim=-1)
-        spreads.append(torch.cat([of_edge, torch.nn.functional.pad(root, (0, _EDGE))], dim=-2))
-    total = torch.cat(weights)
-    return Posterior(total / total.sum(), torch.cat(parameters), torch.cat(spreads), used)
+    shading = matrix.new_tensor(_SHADINGS) * contrast
+    # elimination of edge and sides, with the priors of the slopes in the first dimension
+    precision = matrix[edge, edge].repeat(len(shading), 1, 1)
+    precision[:, _SLOPES, _SLOPES] += shading[:, None] ** -2
+    size = precision.diagonal(dim1=1, dim2=2).sqrt()
+    size = size.clamp(min=1e-12 * float(matrix.diagonal()[edge].max()) ** 0.5)[..., None]
+    precision = precision / size / size.mT
+    precision.diagonal(dim1=1, dim2=2).add_(1e-13)
+    free = (
+        torch.linalg.inv(torch.linalg.cholesky(precision)).mT / size
+    )  # root of the covariance of edge and sides alone
+    follow = -free @ (free.mT @ matrix[edge, rest])
+    start = free @ (free.mT @ right[edge, None])
+    gram = matrix[rest, rest] + matrix[rest, edge] @ follow
+    evidence = 0.5 * (right[edge] @ start)[:, 0] + free.diagonal(dim1=1, dim2=2).log().sum(1) - 2 * shading.log()
+    # modes of tail and splines, which all strengths have in common
+    values, vectors = torch.linalg.eigh(roots.mT @ gram[:, None] @ roots)
+    values, modes = values.clamp(min=0.0)[:, :, None], roots @ vectors
+    projected = (modes.mT @ (right[rest, None] - matrix[rest, edge] @ start)[:, None]).mT
+    shrunk = strength / (1 + strength * values)  # variances (shadings, P, strengths, 1 + K) of the modes
+    gain = 0.5 * (shrunk * projected.square() - torch.log1p(strength * values)).sum(-1)
+    weight = gain + evidence[:, None, None]
+    weight = torch.exp(weight - weight.max())
+    kept = weight > 1e-3
+    of, prior, _ = kept.nonzero().T
+    root = modes[of, prior] * shrunk[kept].sqrt()[:, None]
+    departure = modes[of, prior] @ (shrunk * projected)[kept][..., None]
+    parameters = torch.cat([start[of] + follow[of] @ departure, departure], dim=1)[..., 0]
+    of_edge = torch.cat([follow[of] @ root, free[of]], dim=-1)
+    roots_of_all = torch.cat([of_edge, torch.nn.functional.pad(root, (0, _EDGE))], dim=-2)
+    return Posterior(weight[kept] / weight[kept].sum(), parameters, roots_of_all, kept.any(0).any(-1))
 
 
 # --- Fit and result ---
