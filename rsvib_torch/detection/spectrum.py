@@ -8,7 +8,6 @@ width of the resolution.
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -100,7 +99,7 @@ class DisplacementSpectrum(
         lines = text_table(["axis", "line (px)", "frequency (Hz)"], rows)
         return "\n".join([limits, lines, f"noise (px rms): {noise}"])
 
-    def table(self, *, pixel_size: float | None = None) -> dict[str, list[Any]]:
+    def table(self, *, pixel_size: float | None = None) -> dict[str, list[object]]:
         """One row per frequency; arguments as in ``Result.table``."""
         pixel_size = check_pixel_size(pixel_size)
         columns = {"frequency_Hz": self.frequency, "blind": self.blind}

@@ -90,7 +90,7 @@ class DetectedVibration(
                 rows.append([*labels, measured_text(frequency), *(measured_text(v, relative * v) for v in values)])
         return text_table([*axis_head(self.batch_shape), "frequency (Hz)", *PHYSICAL_HEAD], rows)
 
-    def table(self, *, pixel_size: float | None = None) -> dict[str, list[Any]]:
+    def table(self, *, pixel_size: float | None = None) -> dict[str, list[object]]:
         """One row per tone and axis (and result of a batch); an axis without a tone has one row with tone 0.
 
         The phase refers to the time origin of the vibration, which is that of its stack or window. Amplitudes of roll

@@ -77,7 +77,7 @@ def load_detection(path: Path) -> DetectionResult:
             f"{path}: not a vibration.json, but a file of the format {quoted(data.get('format'))}; give the "
             "vibration.json, or the manifest.json of windows, that rsvib detect or run wrote"
         )
-    result: DetectionResult = result_of(DetectionResult, data, path)
+    result = result_of(DetectionResult, data, path)
     if result.batch_shape:
         raise ValueError(f"{path}: a batch of detections; read it with DetectionResult.load, and pass one of them")
     return result

@@ -60,7 +60,7 @@ def verdict_table(
     rows: Sequence[Sequence[str]],
     batch_shape: Sequence[int],
     reliable: Tensor,
-    reasons: Sequence[Any],
+    reasons: Sequence[Sequence[str]],
 ) -> list[str]:
     """A table with rows that begin as in ``axis_rows``, and the verdict: lines with reasons, or a column in a batch."""
     head = [*axis_head(batch_shape), *head]
@@ -234,7 +234,7 @@ class Result(Summarised):
         result: Self = copy(results[0])
         for name, first in result._fields_of_batch().items():
             values = [getattr(one, name) for one in results]
-            joined: Any = tuple(values)
+            joined: object = tuple(values)
             if isinstance(first, Tensor):
                 joined = torch.stack(values)
             elif isinstance(first, Result):
@@ -255,10 +255,9 @@ class Result(Summarised):
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
         """Read a file that ``save`` wrote."""
-        result: Self = result_of(cls, read_json(Path(path), f"file of {cls.__name__}.save"), Path(path))
-        return result
+        return result_of(cls, read_json(Path(path), f"file of {cls.__name__}.save"), Path(path))
 
-    def table(self, *, pixel_size: float | None = None) -> dict[str, list[Any]]:
+    def table(self, *, pixel_size: float | None = None) -> dict[str, list[object]]:
         """The result as columns by name, with the unit in each name; None for unknown values.
 
         ``to_pandas`` makes a frame of them, and ``write_table`` a CSV file. With the size of a pixel in m, in the plane

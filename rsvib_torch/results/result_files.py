@@ -6,7 +6,7 @@ import os
 import types
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args, get_origin
+from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin
 
 import torch
 from torch import Tensor
@@ -21,21 +21,24 @@ from rsvib_torch.text import quoted
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+R = TypeVar("R")
 
-def result_of(kind: type[Any], data: Table, path: Path) -> Any:
+
+def result_of(kind: type[R], data: Table, path: Path) -> R:
     """A result of a class from the content of a file that ``Result.save`` wrote, see ``Result.load``."""
-    found = str(data.get("format"))
-    if found != kind.file_format or data.get("version") != 1:
+    file_format, found = getattr(kind, "file_format", ""), str(data.get("format"))
+    if found != file_format or data.get("version") != 1:
         content = {"rsvib vibration": "DetectionResult", "rsvib stack": "StackManifest"}.get(found, found[6:])
-        reader = f", which {content}.load reads" if content[:1].isupper() and found != kind.file_format else ""
+        reader = f", which {content}.load reads" if content[:1].isupper() and found != file_format else ""
         raise ValueError(
-            f"{path}: expected format {kind.file_format!r} of version 1, as {kind.__name__}.save writes it, got "
+            f"{path}: expected format {file_format!r} of version 1, as {kind.__name__}.save writes it, got "
             f"{quoted(found)} of version {quoted(data.get('version'))}{reader}"
         )
     try:
-        return decode(kind, data, "")
+        result: R = decode(kind, data, "")
     except (ValueError, RuntimeError, OverflowError) as error:  # of PyTorch and of conversions, for impossible values
         raise ValueError(f"{path}: {str(error).partition(chr(10))[0]}") from error
+    return result
 
 
 def decode(kind: object, value: object, path: str, missing: float = math.nan) -> Any:

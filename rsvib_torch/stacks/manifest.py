@@ -85,7 +85,7 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
         vibration, restoration = self.lines()
         return "\n".join([*vibration, *(restoration if self.output is not None else [])])
 
-    def table(self, *, pixel_size: float | None = None) -> dict[str, list[Any]]:
+    def table(self, *, pixel_size: float | None = None) -> dict[str, list[object]]:
         """One row per tone, axis and window, as in ``DetectedVibration.table``; a failed window has one row.
 
         Phases refer to ``start_s``, the exposure start of the first row of the window.
