@@ -172,27 +172,22 @@ def tracking() -> Figure:
     size, count, motion = 256, 90, live.Changing(sweep=2.0, doublings=0.5)
     timing = live.timing_of(size)
     middle = 0.5 * (size - 1 + live.EXPOSURE_ROWS) * timing.row_time
-    tracker = rsv.VibrationTracker(timing)
-    times, values, stds = [], [], []
-    for frame in live.frames_of(size, motion, count):
-        tracked = tracker.update(frame)
-        found = tracked.detection
-        if found is None:
-            continue
-        times.append(tracked.time + middle)
-        values.append([found.vibration.frequency[:, 0].tolist(), found.vibration.amplitude[:, 0].tolist()])
-        stds.append([found.std.frequency[:, 0].tolist(), found.std.amplitude[:, 0].tolist()])
-    when, truth = np.array(times), (motion.frequency(np.array(times)), motion.amplitude(np.array(times)))
+    tracked = map(rsv.VibrationTracker(timing).update, live.frames_of(size, motion, count))
+    found = [one for one in tracked if one.detection is not None]
+    when = np.array([one.time for one in found]) + middle
     figure = Figure(figsize=(9, 3.2), layout="constrained")
     panels = figure.subplots(1, 2)
-    for place, (quantity, limit) in enumerate((("frequency (Hz)", 0.25), ("amplitude (px)", 0.12))):
-        panel = panels[place]
-        for axis, (name, colour) in enumerate(zip("xy", COLOURS, strict=True)):
-            error = np.array(values)[:, place, axis] - truth[place][:, axis]
-            deviation = 2 * np.array(stds)[:, place, axis]
-            panel.plot(when, error, color=colour, label=name)
-            panel.fill_between(when, -deviation, deviation, color=colour, alpha=0.15, linewidth=0)
-        panel.set(xlabel="time (s)", ylabel=f"error of the {quantity}", ylim=(-limit, limit))
+    quantities = (("frequency", "Hz", 0.25, motion.frequency(when)), ("amplitude", "px", 0.12, motion.amplitude(when)))
+    for panel, (name, unit, limit, truth) in zip(panels, quantities, strict=True):
+        values, stds = (
+            np.stack([getattr(getattr(one.detection, kind), name)[:, 0] for one in found])
+            for kind in ("vibration", "std")
+        )
+        for axis, colour in enumerate(COLOURS):
+            panel.plot(when, (values - truth)[:, axis], color=colour, label="xy"[axis])
+            reach = 2 * stds[:, axis]
+            panel.fill_between(when, -reach, reach, color=colour, alpha=0.15, linewidth=0)
+        panel.set(xlabel="time (s)", ylabel=f"error of the {name} ({unit})", ylim=(-limit, limit))
         panel.axvline(live.BEFORE, color="#d9d9d9", linewidth=1, zorder=0)
         panel.spines[["top", "right"]].set_visible(False)
     panels[0].legend(frameon=False)

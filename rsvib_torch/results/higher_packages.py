@@ -1,15 +1,5 @@
-"""What a package uses of packages above it: they are named in ``rsvib_torch/__init__.py``, and imported when used."""
+"""Imports of what a package uses of packages above it, when it is used; ``rsvib_torch/__init__.py`` states them."""
 
 from collections.abc import Callable
 
-_importers: dict[str, Callable[[], object]] = {}
-
-
-def register(name: str, importer: Callable[[], object]) -> None:
-    """Register a function that imports what is used under a name."""
-    _importers[name] = importer
-
-
-def imported(name: str) -> object:
-    """What is registered under a name."""
-    return _importers[name]()
+IMPORTERS: dict[str, Callable[[], object]] = {}

@@ -24,7 +24,7 @@ from rsvib_torch.checks.values import check_number, described, needed_package
 from rsvib_torch.files.atomic import write_json
 from rsvib_torch.files.reading import Table
 from rsvib_torch.numerics.tables import Array
-from rsvib_torch.results.higher_packages import imported
+from rsvib_torch.results.higher_packages import IMPORTERS
 from rsvib_torch.results.reason import Findings, texts
 from rsvib_torch.results.result_files import figure_png, result_of, write_figure
 from rsvib_torch.text import AXES, data_uri, text_table, wrapped
@@ -339,7 +339,7 @@ class Result(Summarised):
         return figure
 
     def _figure_function(self) -> "Callable[[Any], Figure] | None":
-        imported("figures")  # adds to the table
+        IMPORTERS["figures"]()  # adds to the table
         return FIGURES.get((type(self), len(self.batch_shape)))
 
     def _repr_html_(self) -> str:

@@ -146,13 +146,10 @@ def verdict_sentences(report: Report, result: DetectionResult, removed: Vibratio
 def about_rows(report: Report) -> list[list[str]]:
     """Lines of the table of the report itself: when and how it was made."""
     rows = {"created": report.created.isoformat(" ", "seconds"), "program": f"rsvib_torch {report.version}"}
-    rows |= {"command": report.command or "", "restored with": _chosen(report) if report.was_restored else ""}
+    rows |= {"command": report.command or ""}
+    if report.was_restored:
+        rows |= {"restored with": ", ".join(f"{name} = {value}" for name, value in report.options.items())}
     return [[name, text] for name, text in rows.items() if text]
-
-
-def _chosen(report: Report) -> str:
-    """Options of the restoration."""
-    return ", ".join(f"{name} = {value}" for name, value in report.options.items())
 
 
 def _sentence(text: str) -> str:
