@@ -196,23 +196,14 @@ def straight_edge_mtf(roi: Array, frequency: Array) -> Array:
     return response / np.maximum(np.sinc(2 * frequency / finer) * np.sinc(frequency / finer), 0.1)
 
 
-def mtf_curves(image: Array, edges: Sequence[tuple[str, rsv.SlantedEdge]]) -> dict[str, dict[str, Any]]:
-    """Mean MTF over the edges of each axis, and the frequency at which it is 0.5."""
+def mtf_curves(image: Array, edges: Sequence[tuple[str, rsv.SlantedEdge]]) -> dict[str, list[float]]:
+    """Mean MTF over the edges of each axis, every fifth value."""
     found = {}
     for axis in AXES if edges else ():
         rois = [np.asarray(edge.crop(image)) for of_axis, edge in edges if of_axis == axis]
-        mean = np.mean([straight_edge_mtf(roi if axis == "x" else roi.T, MTF_FREQUENCY) for roi in rois], axis=0)
-        found[axis] = {"curve": mean[::5].tolist(), "mtf50": crossing(MTF_FREQUENCY, mean)}
+        curves = [straight_edge_mtf(roi if axis == "x" else roi.T, MTF_FREQUENCY) for roi in rois]
+        found[axis] = np.mean(curves, axis=0)[::5].tolist()
     return found
-
-
-def crossing(frequency: Array, mtf: Array, level: float = 0.5) -> float:
-    """Frequency at which an MTF first falls to a level; NaN if it does not."""
-    below = int(np.argmax(mtf <= level))
-    if below == 0:
-        return math.nan
-    pair = slice(below - 1, below + 1)
-    return float(np.interp(-level, -mtf[pair], frequency[pair]))
 
 
 # Trials
@@ -246,7 +237,7 @@ def quality(images: Array, still: Array, edges: Sequence[tuple[str, rsv.SlantedE
             "ssim": float(structural_similarity(*pair, data_range=1.0, **window)),
             "mtf": curves,
         }
-        found.append(row | {f"mtf_{axis}": mtf["curve"][-1] for axis, mtf in curves.items()})
+        found.append(row | {f"mtf_{axis}": mtf[-1] for axis, mtf in curves.items()})
     return found
 
 
@@ -367,11 +358,9 @@ def mtf_cells(results: Rows) -> list[list[str]]:
     for axis, direction in AXES.items():
         still = chosen(of_chart, method=STILL)[0]["mtf"][axis]
         for method in (STILL, DEGRADED, *METHODS, JOINT):
-            found = [row["mtf"][axis] for row in chosen(of_chart, method=method)]
-            curves = np.array([one["curve"] for one in found])
-            values = [*(curves[:, place] for place in SHOWN.values()), [one["mtf50"] for one in found]]
-            shown = [f"{np.nanmean(v):.4f} ({np.nanmin(v):.4f} … {np.nanmax(v):.4f})" for v in values]
-            share = (curves.mean(0) / still["curve"])[1:]
+            curves = np.array([row["mtf"][axis] for row in chosen(of_chart, method=method)])
+            shown = [f"{v.mean():.4f} ({v.min():.4f} … {v.max():.4f})" for v in curves.T[list(SHOWN.values())]]
+            share = (curves.mean(0) / still)[1:]
             cells.append([direction, method, *shown, f"{share[:8].min():.3f} … {share.max():.3f}"])
     return cells
 
@@ -418,7 +407,7 @@ def lines(results: Rows, options: argparse.Namespace) -> list[str]:
         (
             f"MTF, noise {noise:g}, mean (smallest … largest) over frames. The last column is the mean curve over that "
             "of the camera at rest: smallest up to 0.4 cycles/px, largest up to Nyquist.",
-            ("axis", "", *SHOWN, "MTF50 (cycles/px)", "over camera at rest"),
+            ("axis", "", *SHOWN, "over camera at rest"),
             mtf_cells(restoration),
         ),
         (
