@@ -126,7 +126,7 @@ def frames_in_turn(report: Report, index: int, image_motion: Tensor) -> Pictures
     if report.was_restored and len(report.restored) == count:
         frames["restored"] = report.restored
     starts = report.timing.frame_starts(count)
-    right, down = (image_motion * float(starts[first + 1] - starts[first])).round().int().tolist()
+    right, down = (image_motion[:2] * float(starts[first + 1] - starts[first])).round().int().tolist()
     height, width = report.frames.shape[-2:]
     if min(height - abs(down), width - abs(right)) < 32:  # px; the two frames have too little in common
         return None
