@@ -29,9 +29,11 @@ def open_npy(path: Path) -> BlockReader:
         check_dtype(dtype)
         if channels_appear_last(shape):
             raise ValueError(f"array of shape {shape} appears to have its channels last; store (T, C, H, W)")
-        if fortran_order:
-            raise ValueError("pixels of a frame lie everywhere in the file; store np.ascontiguousarray(frames)")
-        return contiguous_reader(path, info_from_attributes({}, shape, dtype), head.tell(), dtype)
+        info = info_from_attributes({}, shape, dtype)
+        if fortran_order:  # all frames together: the pixels of a frame lie everywhere in the file
+            frames: Array = np.load(path, mmap_mode="r", allow_pickle=False).reshape(info.shape)
+            return BlockReader(path, info, lambda *_: np.ascontiguousarray(frames), info.shape[0], info.frame_bytes)
+        return contiguous_reader(path, info, head.tell(), dtype)
 
 
 def write_npy(path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None) -> None:

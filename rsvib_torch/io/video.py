@@ -186,6 +186,11 @@ def _scan(path: Path, size: int, changed: int) -> tuple[StackInfo, tuple[Fractio
             even = [known[0] + round((time - known[0]) * rate) / rate for time in known]
             if all(abs(a - b) <= stream.time_base for a, b in zip(even, known, strict=True)):
                 stated = even
+        if first.interlaced_frame:
+            raise ValueError(
+                "it is interlaced: neighbouring rows were taken at the times of two fields; deinterlace it, as by "
+                "ffmpeg -i VIDEO -vf bwdif OUTPUT (-vf setfield=prog if it was not taken in fields)"
+            )
         info = StackInfo(
             (len(times), *pixels.shape),
             pixels.dtype.name,

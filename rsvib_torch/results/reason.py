@@ -155,7 +155,7 @@ _MORE_FRAMES = "use more frames"
 _MAY_BE_STILL = "the camera may stand still along this axis; use more frames if a vibration is expected"
 _FOLLOW = "use follow_vibration if the vibration changes"
 _TONES_OR_FREE = f"{_FOLLOW}, try more tones or detect_motion"
-_CHECK_TIMING = "and check frame_rows, row_time and the start times of the frames"
+_CHECK_TIMING = "and check frame_rows, row_time, exposure_rows and the start times of the frames"
 _UNCERTAIN = "the displacement of the rows is uncertain: {size:.2g} ± {value:.2g} px"
 
 _px = partial(ReasonKind, unit="px")

@@ -2,8 +2,9 @@
 
 Every trial has random phases and noise. The default restoration is done frame by frame, as in the paper, and also
 jointly from both frames. The claims: image motion is not a limitation (Sec. 2.3), and two frames at 24 frames per
-second suffice for 50 Hz, of which a global shutter shows the alias. Scenes are drawn with half the pixel pitch and blurred so that this grid samples them without aliasing; frames of
-``independent_camera`` take every second sample at the displaced positions, so that finer detail aliases as on a sensor.
+second suffice for 50 Hz. Scenes are drawn with half the pixel pitch and blurred so that this grid samples them without
+aliasing; frames of ``independent_camera`` take every second sample at the displaced positions, so that finer detail
+aliases as on a sensor.
 """
 
 import argparse

@@ -176,4 +176,4 @@ def test_raw_frames_behind_colour_filters_on_a_finer_grid(tmp_path):
     assert np.sqrt(np.mean((written - STILL)[:, 12:-12, 12:-12] ** 2)) < 0.06
     assert (out / "before_after.png").exists()
     assert rsvib("report", raw, tmp_path / "page", "--config", config) == 0
-    assert "2 x 2 points per px, the input is interpolated" in (tmp_path / "page" / "report.html").read_text()
+    assert "which have 2 x 2 points per px" in (tmp_path / "page" / "report.html").read_text()

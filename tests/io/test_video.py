@@ -222,6 +222,12 @@ def test_what_a_container_cannot_hold_is_refused_before_the_computation(place, c
     assert not (place / "out").exists()
 
 
+def test_interlaced_videos_are_refused(tmp_path):
+    options = {"codec": "libx264", "encoded": "yuv420p", "options": {"x264-params": "tff=1"}}
+    write_video(tmp_path / "a.mp4", noise(8, 3), TIMES, layout="rgb24", **options)
+    refuses(lambda: read_stack_info(tmp_path / "a.mp4"), r"it is interlaced: .*; deinterlace it, as by ffmpeg")
+
+
 def test_files_that_are_not_videos_are_refused(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with av.open("sound.mp4", "w") as output:
