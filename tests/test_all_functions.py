@@ -198,7 +198,7 @@ def test_results_share_no_memory_with_arguments(name, as_array):
 )
 @pytest.mark.parametrize("name", [name for name in CASES if "Rolling" not in name])  # Kornia draws by the defaults
 def test_defaults_of_pytorch_do_not_change_results(name, dtype, device):
-    """Sums of libraries depend on the alignment of arrays, which changes the last bits; a default of float32, 1e-7."""
+    """Sums of libraries depend on the alignment of arrays, which changes MTF by 4e-8; float32 by 1e-7."""
     function, *arguments = CASES[name]
     given = [[argument.clone() for argument in arguments] for _ in range(2)]
     torch.manual_seed(0)
@@ -213,7 +213,7 @@ def test_defaults_of_pytorch_do_not_change_results(name, dtype, device):
         torch.set_default_device(None)
     assert [one.dtype for one in found] == [one.dtype for one in expected]
     for one, other in zip(found, expected, strict=True):
-        np.testing.assert_allclose(one, other, rtol=2e-8, atol=1e-9)
+        np.testing.assert_allclose(one, other, rtol=7e-8, atol=1e-11)
 
 
 def test_standard_deviations_in_inference_mode():
