@@ -12,7 +12,7 @@ is not of the layer of the corners, which a subject on 40 % of the frame would m
 import math
 from collections.abc import Callable, Iterable, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 
@@ -61,6 +61,10 @@ _DISTINCT = 1.08
 # 0.003 to 0.005 Hz, 2 to 4 standard deviations of noise
 _DRIFT = 0.012
 _ROUNDS = 4  # of a robust fit
+# Parts of the time of a readout, of a reversed one and of frames whose rows are all read at once, and by how much the
+# path leaves less with one of them if the stated readout is wrong: 8 and 4 times of hand-held clips, where tones of
+# 0.2 to 0.8 px were found that are none; at most 1.03 times of 11 other clips
+_OTHER_READOUTS, _CONTRADICTED = {"in reverse": -1.0, "all at once": 0.0}, 2.0
 _HALF, _FOUR_FIFTHS = 1.177, 1.794  # standard deviations, below which that part of lengths of two normal components is
 # Residual of the path of a layer over that of all corners, before tones are found: 0.07 to 0.63 beside a subject on 20
 # to 40 % of the frame, 0.98 to 2.3 in clips with tones of 1.5 to 5 px
@@ -161,6 +165,9 @@ class WindowPath:
     tones: tuple[WindowTone, ...]
     residual: float  # px, robust standard deviation of the offsets of corners along one axis
     residual_of_most: float  # px, likewise; where the path is that of a layer, from four fifths of all corners
+    # how the rows are read instead, if the corners contradict the stated readout, and px, median residuals by the path
+    # with the stated and with this readout
+    other_readout: tuple[str, float, float] | None
 
     def path(self, times: Array, derivative: int = 0) -> Array:
         """(N, 4) components of the path, or their derivatives, at times (N,) in s."""
@@ -497,6 +504,15 @@ def fit_window(
     """
     fit = _WindowFit(corners, interval, averaged)
     fit.solve(_ROUNDS)
+    # The readout that explains the corners best, before tones are found.
+    other_readout, limit = None, fit.unexplained / _CONTRADICTED
+    for name, part in _OTHER_READOUTS.items() if has_tones and len(slopes) == 1 else ():
+        moved = (1.0 - part) * readout * (corners.rows - 0.5)
+        other = _WindowFit(replace(corners, times=corners.times - moved[:, None]), interval, averaged)
+        other.solve(_ROUNDS)
+        if other.unexplained < limit:
+            limit = other.unexplained
+            other_readout = name, math.sqrt(fit.unexplained), math.sqrt(limit)
     fit = fit.of_layer()
     # Frequencies above those that the path follows, up to those that rows resolve, without blind ones.
     step = 0.3 / (fit.times.max() - fit.times.min())
@@ -545,7 +561,9 @@ def fit_window(
     residual = residual_of_most = float(np.median(fit.distance)) / _HALF
     if not fit.layer.all():  # with a subject on 40 % of the frame, tones of 0.1 px were found that are none
         residual_of_most = float(np.quantile(fit.distance, 0.8)) / _FOUR_FIFTHS
-    return WindowPath(fit.origin, fit.start, fit.step, knots, tuple(fit.tones), residual, residual_of_most)
+    return WindowPath(
+        fit.origin, fit.start, fit.step, knots, tuple(fit.tones), residual, residual_of_most, other_readout
+    )
 
 
 @dataclass(frozen=True, eq=False)

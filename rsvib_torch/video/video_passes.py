@@ -296,13 +296,19 @@ class VideoPasses:
         vibration = Vibration(amplitude, frequency, phase, velocity, acceleration)
         findings = self._findings(tones, window)
         copies = np.count_nonzero(np.diff(times) <= 0) / len(times)
-        for code, value, allowed in (
-            ("corners_unexplained", window.residual_of_most, path.allowed),
-            ("frames_repeated", copies, _MAX_COPIES),
-        ):
-            if value > allowed:
-                against = Reason(code, None, value, allowed)
-                findings = tuple((*(one for one in of if one.code != "no_tone"), against) for of in findings)
+        against = [
+            Reason(code, None, value, allowed)
+            for code, value, allowed in (
+                ("corners_unexplained", window.residual_of_most, path.allowed),
+                ("frames_repeated", copies, _MAX_COPIES),
+            )
+            if value > allowed
+        ]
+        if window.other_readout is not None:
+            name, stated, other = window.other_readout
+            against.append(Reason("readout_contradicted", None, stated, other, {"other": name}))
+        if against:
+            findings = tuple((*(one for one in of if one.code != "no_tone"), *against) for of in findings)
         timing, std = self.frames.job.timing, VibrationStd(*(torch.from_numpy(np.array(value)) for value in values))
         coefficients = amplitude * np.exp(1j * (phase - 0.5 * math.pi))
         fit = ToneFit(

@@ -1,5 +1,7 @@
 """The path of a camera and its vibration from corners, on frames of a camera that is held by hand, with parallax."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates, spline_filter
@@ -87,8 +89,14 @@ def test_tones_and_path_of_a_hand_with_parallax_and_a_subject():
     assert np.sqrt(np.mean([shake(pair)[1] ** 2 for pair in pairs])) > 0.3  # the rows vibrate
 
 
-def test_a_hand_without_vibration_has_no_tones():
-    assert fitted(recorded({}, subject=False))[1].tones(0.5) == []
+def test_a_hand_without_vibration_has_no_tones_and_shows_the_readout():
+    frames = recorded({}, subject=False)
+    right, reverse = (fitted(frames, replace(TIMING, readout_direction=way))[1] for way in ("forward", "reverse"))
+    assert right.tones(0.5) == []
+    assert right.windows[0].other_readout is None
+    other, stated, with_other = reverse.windows[0].other_readout
+    assert other == "in reverse"
+    assert with_other < 0.7 * stated
 
 
 def test_a_part_of_the_rows_that_moves_by_itself_is_no_vibration():
