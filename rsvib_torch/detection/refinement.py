@@ -271,7 +271,7 @@ class Refinement:
         return True
 
     def accelerate(self) -> None:
-        """Continue with a faster step where the last one was inexact, with the same gradients after a short step."""
+        """Accelerate the last step from the ones before; the gradients are kept where it is short."""
         if self._gradients is None:  # it has just begun again
             return
         measurements = self._measured.measurements

@@ -25,7 +25,8 @@ from rsvib_torch.io.stack_reading import FramesOrFiles, load_frames
 from rsvib_torch.motion.timing import RowTiming, SensorTiming, check_timing
 
 Saturation = float | Literal["auto"] | None
-_MOST_COUNTS = 1.1  # of full scale; the noise of simulated frames may exceed it by less
+# of full scale: the noise of simulated frames may exceed it by less, and frames of a greater bit depth reach twice it
+_MOST_COUNTS = 1.1
 
 
 @dataclass(frozen=True, eq=False)

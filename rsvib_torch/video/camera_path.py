@@ -539,6 +539,7 @@ def fit_window(
         trials = [fit.with_tone(axis, float(alias), slope) for alias in aliases[inside & fit.is_apart(axis, aliases)]]
         best, *others = sorted(trials, key=lambda trial: trial.unexplained)
         found = {of: value for of, value in found.items() if of[0] != axis}
+        # the path decides between the aliases only if the best of them leaves clearly less; otherwise none is stated
         if others and others[0].unexplained < _DISTINCT * best.unexplained:
             left_out[axis] |= np.any([~fit.is_apart_from(alias, frequencies) for alias in aliases], axis=0)
             continue

@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import cached_property
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
@@ -117,11 +118,24 @@ class VideoOutput:
             sync(self._path)
 
 
+class _PageFrame:
+    """A frame of the page, which is encoded at its first request only."""
+
+    def __init__(self, frame: Frame) -> None:
+        self._frame = frame
+
+    @cached_property
+    def jpeg(self) -> bytes:
+        """The frame in a JPEG file."""
+        colours = self._frame if self._frame.ndim == 2 else np.ascontiguousarray(self._frame[..., ::-1])
+        return cv2.imencode(".jpg", colours, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
+
+
 class PageOutput:
     """Restored frames at ``http://127.0.0.1:PORT``; the port 0 chooses a free one. ``url`` is the address."""
 
     def __init__(self, port: int) -> None:
-        self._frame: Frame | None = None  # the last one; it is encoded when a browser asks for it
+        self._frame: _PageFrame | None = None  # the last one
         self._state = "waiting for frames"
         output = self
 
@@ -140,7 +154,7 @@ class PageOutput:
                 elif name == "/state":
                     self._send("text/plain; charset=utf-8", output._state.encode())
                 elif name == "/frame" and output._frame is not None:
-                    self._send("image/jpeg", _jpeg(output._frame))
+                    self._send("image/jpeg", output._frame.jpeg)
                 else:
                     self.send_error(404)
 
@@ -169,14 +183,9 @@ class PageOutput:
 
     def write(self, frame: Frame, index: int) -> None:
         """Show a frame."""
-        self._frame = frame
+        self._frame = _PageFrame(frame)
 
     def close(self) -> None:
         """End the page."""
         self._server.shutdown()
         self._server.server_close()
-
-
-def _jpeg(frame: Frame) -> bytes:
-    colours = frame if frame.ndim == 2 else np.ascontiguousarray(frame[..., ::-1])
-    return cv2.imencode(".jpg", colours, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()

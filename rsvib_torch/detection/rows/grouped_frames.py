@@ -176,6 +176,11 @@ _MAX_SLIDE_OF_BLUR = 0.15  # px
 _MAX_SLIDE, _MIN_PITCH = 0.1, 48
 
 
+def _pitch(slope: float) -> float:
+    """The distance of strips in px where the displacement changes by ``slope`` px per column."""
+    return max(_MIN_PITCH, _MAX_SLIDE / max(slope, 1e-9))
+
+
 def _in_rad(motion: Vibration | FreeMotion, scale: FieldScale) -> Vibration | FreeMotion:
     """The motion with roll in rad and relative zoom."""
     return scale.free_motion(motion) if isinstance(motion, FreeMotion) else scale.motion(motion)
@@ -236,7 +241,8 @@ class GroupedStrips(GroupedFrames):
         starts = self.timing.row_starts(self.num_frames, self.scale.height)
         pitch = float(self.columns[1] - self.columns[0])
         slope = _slope(_in_rad(motion, self.scale), self.scale, starts)
-        return pitch <= 1.5 * max(_MIN_PITCH, _MAX_SLIDE / max(slope, 1e-9))
+        # a second fit takes as long as the first; strips that are slightly too wide caused no bias that was measured
+        return pitch <= 1.5 * _pitch(slope)
 
     def blur_ratio(self, motion: Vibration) -> Tensor:
         """(B, 3), the weighted mean over every second strip: they contain all columns.
@@ -274,7 +280,7 @@ def grouped_strips(
     along = of_ends.mean_displacement(times, timing.exposure_time)[..., 0] - of_ends.drift(times)[..., 0]
     margin = math.ceil(float(along.abs().amax()) + 1.0) + MARGIN  # 1 px: whole pixels of an image motion
     slope = _slope(field, scale, starts)
-    strips = ColumnStrips.between_ends(scale.width, max(_MIN_PITCH, _MAX_SLIDE / max(slope, 1e-9)), margin)
+    strips = ColumnStrips.between_ends(scale.width, _pitch(slope), margin)
     spectra = stack_spectra(frames, valid, strips)
     columns = strips.columns.to(frames.device)
     view = ColumnMotion.of_columns(field, columns, timing, count, scale.height)
