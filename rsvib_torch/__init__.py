@@ -10,6 +10,7 @@ import lazy_loader
 
 from rsvib_torch.results.higher_packages import IMPORTERS
 
+IMPORTERS["files"] = lambda: import_module("rsvib_torch.io.stack_reading")
 IMPORTERS["figures"] = lambda: import_module("rsvib_torch.report.plots")
 __getattr__, __dir__, _names = lazy_loader.attach_stub(__name__, __file__)
 __all__ = [name for name in _names if not (Path(__file__).parent / name).is_dir()]  # without the packages

@@ -11,6 +11,7 @@ LAYERS: tuple[dict[str, str], ...] = (
     },
     {"config": "TOML files ↔ groups of options"},
     {"stacks": "process.py: windows, jobs, memory planning; run_folder.py: a run to a file, and how it resumes"},
+    {"io": "stack_reading.py, stack_writing.py, formats.py (table of formats), one module per format"},
     {
         "evaluation": "image quality, slanted edge (mtf/), Cramér–Rao bound",
         "tracking": "tracker.py: vibration frame by frame; following.py: through a stack, forwards and backwards",
@@ -25,8 +26,7 @@ LAYERS: tuple[dict[str, str], ...] = (
     },
     {"registration": "offsets of bands (register.py, methods.py) and of rows (gradients.py) between frames"},
     {"imaging": "image formation: trajectory, point spread function, blur, optics, noise, simulator"},
-    {"frames": "prepare.py: files and arrays, dtypes, full scale, masks, orientation; entry_points.py: flat options"},
-    {"io": "stack_reading.py, stack_writing.py, formats.py (table of formats), one module per format"},
+    {"frames": "prepare.py: arrays, dtypes, full scale, masks, orientation; entry_points.py: flat options"},
     {"motion": "SensorTiming, Camera, readout times of camera models, Motion, Vibration, FreeMotion, recorded motion"},
     {
         "results": "summary, dictionary, files, figures and reasons of all results",

@@ -14,6 +14,8 @@ from rsvib_torch.checks.values import check_choice
 
 ArrayLike = Tensor | NDArray[Any]
 FramesLike = ArrayLike | Sequence[ArrayLike]
+PathLike = str | os.PathLike[str]
+FramesOrFiles = FramesLike | PathLike | Sequence[PathLike]
 Channels = Literal["first", "last"] | None
 
 

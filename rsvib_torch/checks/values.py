@@ -182,3 +182,8 @@ def needed_package(name: str, purpose: str, extra: str) -> types.ModuleType:
             raise
         needed = f"{purpose} needs the package {name.partition('.')[0]}: pip install rsvib_torch[{extra}]"
         raise ModuleNotFoundError(needed, name=error.name) from error
+
+
+def beyond_full_scale(largest: int, full_scale: float) -> str:
+    """Message for counts that exceed the full scale."""
+    return f"counts reach {largest}, beyond full_scale={full_scale:g}; pass a full_scale of at least the largest count"

@@ -3,6 +3,7 @@
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
+from rsvib_torch.checks.arrays import FramesOrFiles
 from rsvib_torch.checks.values import check_choice
 from rsvib_torch.detection.attempts import FieldOptions, detect_tones
 from rsvib_torch.detection.pipeline import METHODS, DetectionOptions
@@ -13,7 +14,6 @@ from rsvib_torch.execution.parallel import threads_for
 from rsvib_torch.execution.precision import full_precision, without_gradients
 from rsvib_torch.frames.entry_points import TimedModule, frames_options, module_options
 from rsvib_torch.frames.grey import grey_frames
-from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import VibrationOptions
 

@@ -13,9 +13,9 @@ import torch
 from torch import Tensor, nn
 
 from rsvib_torch.checks.arguments import checks_arguments
+from rsvib_torch.checks.arrays import FramesOrFiles, PathLike
 from rsvib_torch.checks.validation import fields_of, flat_options
 from rsvib_torch.execution.precision import outside_graphs
-from rsvib_torch.io.stack_reading import FramesOrFiles, PathLike
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming, check_timing

@@ -7,11 +7,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from rsvib_torch.checks.arrays import FramesOrFiles
 from rsvib_torch.frames.mosaic import is_mosaic, mosaic_free
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.frames.pixels import cut_columns, detailed_parts
 from rsvib_torch.frames.prepare import prepare_frames
-from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import MaskedInputOptions
 

@@ -14,14 +14,12 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import check_pixels
-from rsvib_torch.checks.arrays import Channels, FramesLike, as_tensor, channel_axis
-from rsvib_torch.checks.values import check_number
+from rsvib_torch.checks.arrays import Channels, FramesLike, FramesOrFiles, as_tensor, channel_axis
+from rsvib_torch.checks.values import beyond_full_scale, check_number
+from rsvib_torch.frames.loading import load_frames
 from rsvib_torch.frames.mosaic import check_mosaic, colours_of, fill_by_colour, luminance, mosaic_free
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.frames.pixels import fill_with_means
-from rsvib_torch.io.frame_times import timing_from_first_frame
-from rsvib_torch.io.full_scale import beyond_full_scale
-from rsvib_torch.io.stack_reading import FramesOrFiles, load_frames
 from rsvib_torch.motion.timing import RowTiming, SensorTiming, check_timing
 
 Saturation = float | Literal["auto"] | None
@@ -123,8 +121,8 @@ def prepare_frames(
     # files: their pixels as stored, with the full scale and the times that they state
     loaded = load_frames(frames, full_scale)
     full_scale = loaded.full_scale
-    if loaded.info is not None:
-        timing = timing_from_first_frame(timing, loaded.info)
+    if loaded.timed is not None:
+        timing = loaded.timed(timing)
     given = as_tensor(name, loaded.frames)
     axis = channel_axis(name, given.shape, channels)
     if given.ndim == 4 and channels is None and loaded.frames is frames and given.shape[1] not in (1, 3, 4):

@@ -13,6 +13,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
+from rsvib_torch.checks.arrays import FramesOrFiles
 from rsvib_torch.checks.validation import Number
 from rsvib_torch.checks.validation import options as option_group
 from rsvib_torch.checks.values import check_single, described
@@ -33,7 +34,6 @@ from rsvib_torch.frames.orientation import (
 from rsvib_torch.gyroscope.corner_tracks import corner_tracks
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
 from rsvib_torch.gyroscope.rotation_alignment import RotationAlignment, align_rates, offset_range, outside
-from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks.values import check_number
+from rsvib_torch.checks.values import beyond_full_scale, check_number
 from rsvib_torch.numerics.tables import Array
 
 _NOT_RELATIVE = 10.0  # of full scale 1; pixels beyond are counts or percents
@@ -42,11 +42,6 @@ def required_full_scale(full_scale: float | None, dtype: np.dtype, name: object)
     known = known_full_scale(dtype, full_scale)
     assert known is not None  # of integers
     return known
-
-
-def beyond_full_scale(largest: int, full_scale: float) -> str:
-    """Message for counts that exceed the full scale."""
-    return f"counts reach {largest}, beyond full_scale={full_scale:g}; pass a full_scale of at least the largest count"
 
 
 def full_scale_of_counts(counts: Array, full_scale: float | None, name: str) -> float:

@@ -6,24 +6,24 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import checks_arguments
-from rsvib_torch.checks.arrays import FramesLike
+from rsvib_torch.checks.arrays import PathLike
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.files.free_memory import check_fits
+from rsvib_torch.frames.loading import LoadedFrames
 from rsvib_torch.io.blocks import part_reader
 from rsvib_torch.io.formats import find_format
+from rsvib_torch.io.frame_times import timing_from_first_frame
 from rsvib_torch.io.full_scale import counts_to_frames, full_scale_of_counts
 from rsvib_torch.io.stack_info import FrameReader, StackInfo, split_range
+from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array
 
-PathLike = str | os.PathLike[str]
-FramesOrFiles = FramesLike | PathLike | Sequence[PathLike]
 _FRAME_COPIES = 24  # bytes per pixel of one frame while it is decoded and converted
 _MAX_FRAMES = 10**7  # frames; reading that many frames of one pixel takes a minute
 
@@ -149,24 +149,13 @@ def _read_pixels(
     return parts[0] if len(parts) == 1 else np.concatenate(parts), stated, first
 
 
-class LoadedFrames(NamedTuple):
-    """Frames in memory, from the argument ``frames`` of a function."""
-
-    frames: FramesLike  # tensor, array or list of these; integers as stored, unless the file has a nodata value
-    full_scale: float | None  # count that corresponds to 1.0; None if it is unknown, and for floats of a file
-    info: StackInfo | None  # what the file states, if the frames were given by one path
-
-
-def load_frames(frames: FramesOrFiles, full_scale: float | None) -> LoadedFrames:
-    """Read frames that are given by the paths of their files; other frames are returned unchanged."""
-    if isinstance(frames, (str, os.PathLike)):
-        paths: list[PathLike] = [frames]
-    elif isinstance(frames, (list, tuple)) and frames and all(isinstance(item, (str, os.PathLike)) for item in frames):
-        paths = list(frames)
-    else:
-        return LoadedFrames(cast(FramesLike, frames), full_scale, None)
+def load_files(paths: Sequence[PathLike], full_scale: float | None) -> LoadedFrames:
+    """Frames of files as the argument ``frames`` of a function, with the times of the first file."""
     pixels, full_scale, first = _read_pixels(paths, full_scale, as_counts=True)
-    info = None if isinstance(frames, (list, tuple)) else first  # several files have no common time
+
+    def timed(timing: SensorTiming) -> SensorTiming:
+        return timing_from_first_frame(timing, first)
+
     if pixels.dtype.kind == "f":
-        return LoadedFrames(torch.from_numpy(pixels), None, info)
-    return LoadedFrames(pixels, full_scale_of_counts(pixels, full_scale, str(paths[0])), info)
+        return LoadedFrames(torch.from_numpy(pixels), None, timed)
+    return LoadedFrames(pixels, full_scale_of_counts(pixels, full_scale, str(paths[0])), timed)

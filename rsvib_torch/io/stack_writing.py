@@ -8,14 +8,13 @@ import numpy as np
 import torch
 
 from rsvib_torch.checks.arguments import checks_arguments
-from rsvib_torch.checks.arrays import Channels, FramesLike, as_tensor, channel_axis
+from rsvib_torch.checks.arrays import Channels, FramesLike, PathLike, as_tensor, channel_axis
 from rsvib_torch.checks.values import check_choice
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.files.atomic import check_outputs, check_target, check_writable, whole
 from rsvib_torch.io.formats import FORMATS, StackFormat, target_format
 from rsvib_torch.io.full_scale import check_dtype, frames_to_counts, known_full_scale, required_full_scale
 from rsvib_torch.io.stack_info import DIFFERENT, StackInfo, split_range
-from rsvib_torch.io.stack_reading import PathLike
 from rsvib_torch.numerics.tables import Array
 
 

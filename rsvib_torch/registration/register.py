@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch.checks.arrays import FramesOrFiles
 from rsvib_torch.checks.values import check_choice
 from rsvib_torch.execution.chunking import at_once, chunks, runs
 from rsvib_torch.execution.progress import steps
@@ -23,7 +24,6 @@ from rsvib_torch.frames.entry_points import frames_options
 from rsvib_torch.frames.orientation import offsets_from_row_order, sequence_from_row_order
 from rsvib_torch.frames.pixels import smoothed
 from rsvib_torch.frames.prepare import prepare_frames
-from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.numerics.fourier import fast_length
 from rsvib_torch.options import BandRegistrationOptions, RegistrationOptions

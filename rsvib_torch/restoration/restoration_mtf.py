@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from rsvib_torch.checks.arrays import FramesOrFiles
 from rsvib_torch.frames.entry_points import vibration_options
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.imaging.sensor_model import sharpened
 from rsvib_torch.imaging.trajectory import exposure_trajectory
-from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.field import check_two_axes
 from rsvib_torch.motion.motion import Motion

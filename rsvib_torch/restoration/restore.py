@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks.arrays import ArrayLike
+from rsvib_torch.checks.arrays import ArrayLike, FramesOrFiles
 from rsvib_torch.execution.parallel import threads_for
 from rsvib_torch.execution.precision import full_precision, outside_graphs
 from rsvib_torch.frames.entry_points import TimedModule, module_options, vibration_options
@@ -16,7 +16,6 @@ from rsvib_torch.frames.mosaic import interpolated_colours
 from rsvib_torch.frames.pixels import enlarged
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
 from rsvib_torch.imaging.sensor_model import Optics, sharpened
-from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.detected_vibration import DetectedVibration, FollowedVibration
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming

@@ -16,6 +16,7 @@ import numpy as np
 from pydantic import Field
 from scipy import linalg
 
+from rsvib_torch.checks.arrays import FramesOrFiles
 from rsvib_torch.checks.validation import Number, Positive
 from rsvib_torch.checks.validation import options as option_group
 from rsvib_torch.checks.values import check_number
@@ -27,7 +28,6 @@ from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.entry_points import entry_point
 from rsvib_torch.frames.grey import GreyFrames, grey_frames
 from rsvib_torch.frames.orientation import reasons_from_row_order
-from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.splines import spline_taps
 from rsvib_torch.numerics.tables import Array

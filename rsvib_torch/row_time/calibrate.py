@@ -10,10 +10,9 @@ from pydantic import Field
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import checks_arguments
-from rsvib_torch.checks.arrays import Channels
+from rsvib_torch.checks.arrays import Channels, FramesOrFiles
 from rsvib_torch.checks.validation import Positive
 from rsvib_torch.checks.values import check_number
-from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.results.presentation import JudgedResult
 from rsvib_torch.results.reason import Reason

@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 from torch import Tensor, nn
 
+from rsvib_torch.checks.arrays import FramesOrFiles
 from rsvib_torch.detection import DetectionResult, VibrationDetector
-from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import OptionTable
 from rsvib_torch.restoration import VibrationRestorer

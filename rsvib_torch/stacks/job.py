@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import checks_arguments
-from rsvib_torch.checks.arrays import Channels, channel_axis
+from rsvib_torch.checks.arrays import Channels, PathLike, channel_axis
 from rsvib_torch.checks.values import check_choice
 from rsvib_torch.detection import detect_vibration
 from rsvib_torch.files.reading import Table
@@ -23,7 +23,7 @@ from rsvib_torch.io import full_scale as scales
 from rsvib_torch.io.frame_times import exposure_times, timing_of_stack
 from rsvib_torch.io.full_scale import counts_to_frames
 from rsvib_torch.io.stack_info import FrameError, FrameReader, StackInfo
-from rsvib_torch.io.stack_reading import PathLike, open_stack, read_stack_info
+from rsvib_torch.io.stack_reading import open_stack, read_stack_info
 from rsvib_torch.motion.detected_vibration import DetectedVibration, FollowedVibration
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming

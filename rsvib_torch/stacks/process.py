@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from rsvib_torch.checks.arrays import PathLike
 from rsvib_torch.files.atomic import check_outputs, check_writable
 from rsvib_torch.files.reading import Table
 from rsvib_torch.frames.entry_points import file_options, source_options
-from rsvib_torch.io.stack_reading import PathLike
 from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, stack_files, write_frames
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array

@@ -9,12 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks.values import MAX_NUMBER
+from rsvib_torch.checks.values import MAX_NUMBER, beyond_full_scale
 from rsvib_torch.frames.grey import constant_frame
 from rsvib_torch.frames.pixels import detailed_parts
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.imaging.sensor_model import sharpened
-from rsvib_torch.io.full_scale import beyond_full_scale
 from rsvib_torch.motion.detected_vibration import DetectedVibration, FollowedVibration
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming

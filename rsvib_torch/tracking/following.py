@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch.checks.arrays import FramesOrFiles
 from rsvib_torch.detection.shapes.free import start_of_stack
 from rsvib_torch.detection.tones.fit import residual_of
 from rsvib_torch.detection.verdict import Findings, scene_reasons
@@ -25,7 +26,6 @@ from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.entry_points import frames_options
 from rsvib_torch.frames.grey import GreyFrames, grey_frames
 from rsvib_torch.frames.orientation import findings_from_row_order, magnitudes_from_row_order
-from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.detected_vibration import FollowedVibration
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from rsvib_torch.checks.arrays import PathLike
 from rsvib_torch.checks.validation import fields_of
 from rsvib_torch.execution.parallel import in_threads
 from rsvib_torch.files.atomic import whole_file
@@ -20,7 +21,7 @@ from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
 from rsvib_torch.gyroscope.read_gyroscope import read_gyroscope
 from rsvib_torch.gyroscope.rotation_alignment import RotationAlignment
 from rsvib_torch.io.stack_info import StackInfo, split_range
-from rsvib_torch.io.stack_reading import PathLike, open_stack
+from rsvib_torch.io.stack_reading import open_stack
 from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, stack_files
 from rsvib_torch.io.video import CONTAINERS, VideoReader, join_parts, part_of_video
 from rsvib_torch.motion.camera import Camera

@@ -20,6 +20,7 @@ from scipy import linalg, sparse
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch.checks.arrays import FramesOrFiles
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
 from rsvib_torch.detection.rows.grouped_frames import (
@@ -42,7 +43,6 @@ from rsvib_torch.execution.precision import full_precision, without_gradients
 from rsvib_torch.frames.entry_points import frames_options
 from rsvib_torch.frames.grey import GreyFrames, grey_frames
 from rsvib_torch.frames.orientation import findings_from_row_order, magnitudes_from_row_order, offsets_from_row_order
-from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.field import ColumnMotion
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import check_shapes
+from rsvib_torch.checks.arrays import FramesOrFiles
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.grouped_frames import grouped_frames
 from rsvib_torch.detection.sensitivity import displacements_by_row_time
@@ -33,7 +34,6 @@ from rsvib_torch.execution.progress import whole_steps
 from rsvib_torch.frames.entry_points import frames_options
 from rsvib_torch.frames.grey import GreyFrames, grey_frames
 from rsvib_torch.frames.orientation import findings_from_row_order, magnitudes_from_row_order, offsets_from_row_order
-from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.splines import gauss_legendre

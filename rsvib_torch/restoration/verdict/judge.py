@@ -14,14 +14,14 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import checks_arguments
-from rsvib_torch.checks.arrays import ArrayLike, Channels, as_tensor
+from rsvib_torch.checks.arrays import ArrayLike, Channels, FramesOrFiles, as_tensor
 from rsvib_torch.checks.values import check_whole_number
 from rsvib_torch.execution.chunking import at_once, runs
 from rsvib_torch.execution.progress import steps
+from rsvib_torch.frames.loading import load_frames
 from rsvib_torch.frames.orientation import reasons_from_row_order
 from rsvib_torch.frames.pixels import cut_columns, detailed_parts
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
-from rsvib_torch.io.stack_reading import FramesOrFiles, load_frames
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.field import ColumnMotion
 from rsvib_torch.motion.motion import Motion
