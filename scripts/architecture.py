@@ -4,7 +4,7 @@
 # other. The text says what a part contains.
 LAYERS: tuple[dict[str, str], ...] = (
     {"commands": "the rsvib program: options, progress, output on the terminal"},
-    {"video": "process_video.py: videos in two passes; camera_path.py, steadying.py; session.py: a running camera"},
+    {"video": "process_video.py: videos in two passes; steadying.py; session.py: a running camera"},
     {
         "report": "results on disk: JSON, CSV, figures (plots.py), HTML page (html/)",
         "export": "motions for other programs: angular rates",
@@ -14,11 +14,11 @@ LAYERS: tuple[dict[str, str], ...] = (
     {"io": "stack_reading.py, stack_writing.py, formats.py (table of formats), one module per format"},
     {
         "evaluation": "image quality, slanted edge (mtf/), Cramér–Rao bound",
-        "tracking": "tracker.py: vibration frame by frame; following.py: through a stack, forwards and backwards",
         "row_time": "row time of a camera from flickering light or motion",
         "augmentation": "training data for Kornia pipelines",
         "datasets": "drawn scenes and example frames",
     },
+    {"tracking": "tracker.py: vibration frame by frame; following.py: through a stack; camera_path.py: path of a hand"},
     {"gyroscope": "recorded motions: files, alignment of clock and axes with frames"},
     {
         "detection": "detect.py: frames → motion, standard deviations, verdict",

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.numerics.tables import tensor
-from rsvib_torch.registration.corners import CornerFollower, Corners, Grey
+from rsvib_torch.numerics.tables import Array, tensor
+from rsvib_torch.registration.corners import CornerFollower, Corners, Grey, eight_bits
 
 CELL_ROWS, CELL_COLUMNS = 6, 8  # cells of a frame, in which residuals may be alike
 _MOST_CORNERS = 480  # of a pair of frames
@@ -61,14 +61,14 @@ def corner_tracks(
     follow each other. Refused are frames of which fewer than half of the pairs have enough corners.
     """
     follower = CornerFollower(timing, most=_MOST_CORNERS, consistent=False)
-    levels: tuple[float, float] | None = None
+    levels: Array | None = None
     size, before = (0, 0), -2
     pairs: dict[int, Corners] = {}
     for number, frame, valid in frames:
         values = frame.cpu().numpy()
         if levels is None:  # the same for all frames, so that places keep their grey level
             levels, size = np.percentile(values, (0.1, 99.9)), (values.shape[0], values.shape[1])
-        grey = np.interp(values, levels, (0, 255)).round().astype(np.uint8)
+        grey = eight_bits(values, levels)
         followed = follower.next(grey, starts[number], None if valid is None else _inner(valid))
         if followed is not None and before == number - 1:
             pairs[before] = followed

@@ -188,6 +188,11 @@ def _stands_still(found: Points, rests: NDArray[np.bool_], shape: tuple[int, ...
     return bool((left and right) or (top and bottom))
 
 
+def eight_bits(frame: Array, levels: Array) -> Grey:
+    """A frame in 8 bits, in which OpenCV follows corners, between two levels that become 0 and 255."""
+    return np.asarray(np.interp(frame, levels, (0, 255)).round(), np.uint8)
+
+
 def reduction(height: int, width: int) -> int:
     """By how much the sides of frames are reduced before corners are followed."""
     return int(2 ** max(0, math.ceil(0.5 * math.log2(height * width / _MOST_PIXELS))))

@@ -35,6 +35,7 @@ from rsvib_torch.options import OffsetOptions, RegistrationOptions
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.results.reason import Reason
 from rsvib_torch.row_time import RowTimeCalibration
+from rsvib_torch.row_time.by_path import row_time_of_path
 from rsvib_torch.row_time.by_tones import (
     MAX_CHI_SQUARE,
     CameraClock,
@@ -42,13 +43,13 @@ from rsvib_torch.row_time.by_tones import (
     FramePlaces,
     RowTimeFit,
     bands_of_frames,
+    is_tone,
     refined,
     row_time_of_tones,
 )
 
 P = ParamSpec("P")
 
-MAX_RELATIVE_STD = 0.01  # of the row time; frequencies and the distortion of frames have the same relative error
 _MIN_FRAMES = 3  # two frames determine the product of row time and frequency only
 SHORTEST_READOUT = 0.1  # of the frame period, if no row times are given
 DEGREE = 7  # a simulated motion of 8 Hz bandwidth needs knots of 11 ms to its noise, and of 8 ms with degree 3
@@ -151,14 +152,20 @@ def calibrate_row_time_by_motion(frames: FramesOrFiles, options: RowTimeOptions)
     else:
         with threads_for(stack.images):
             curve, bands = bands_of_frames(stack, clock, options)
+            by_path = None if is_tone(curve) else row_time_of_path(stack, clock)
+            if by_path is not None:
+                clock = clock.near(by_path)
             by_tones = row_time_of_tones(stack, clock, options, bands)
             found = by_tones or _undetermined(Reason("no_motion_for_row_time"))
-            if found.findings:
+            if found.findings and not is_tone(curve):
                 places = _measured_freely(stack, clock, options, curve)
-                spline = row_time_of_splines(places, num_rows, low, high, directions)
-                if spline is not None and spline[0].std < MAX_RELATIVE_STD * abs(spline[0].row_time):
+                spline = row_time_of_splines(places, clock)
+                if spline is not None and spline[0].std < spline[0].permitted * abs(spline[0].row_time):
                     found, spacing = spline
                     notes.append(f"the motion is no sum of few tones: a spline with knots {1e3 * spacing:.3g} ms apart")
+                elif by_path is not None:
+                    found = by_path
+                    notes.append("the motion is that of a hand or a flight: the path of corners over all rows")
     return _result(replace(found, findings=reasons_from_row_order(found.findings, sensor)), clock, notes)
 
 
@@ -203,8 +210,8 @@ def _result(found: RowTimeFit, clock: CameraClock, notes: list[str]) -> RowTimeC
         listed = ", ".join(f"{1e6 * one.row_time:.4f}" for one in found.others[:8])
         details: dict[str, float | str] = {"row_time": 1e6 * found.row_time, "others": listed}
         findings.append(Reason("row_times_ambiguous", None, len(found.others) + 1, 1, details))
-    if known and found.std > MAX_RELATIVE_STD * abs(found.row_time):
-        findings.append(Reason("row_time_uncertain", None, found.std / abs(found.row_time), MAX_RELATIVE_STD))
+    if known and found.std > found.permitted * abs(found.row_time):
+        findings.append(Reason("row_time_uncertain", None, found.std / abs(found.row_time), found.permitted))
     exposure, exposure_std = (found.exposure_time, found.exposure_std) if known else (None, None)
     if clock.exposure_time is not None:
         exposure, exposure_std = clock.exposure_time, 0.0
@@ -226,15 +233,14 @@ def _result(found: RowTimeFit, clock: CameraClock, notes: list[str]) -> RowTimeC
     )
 
 
-def row_time_of_splines(
-    places: FramePlaces, num_rows: int, low: float, high: float, directions: tuple[float, ...]
-) -> tuple[RowTimeFit, float] | None:
+def row_time_of_splines(places: FramePlaces, clock: CameraClock) -> tuple[RowTimeFit, float] | None:
     """Row time at which the fewest knots explain the displacements, and their distance in s; None if no motion does."""
+    num_rows, low, high = clock.num_rows, clock.low, clock.high
     places = places.centred(num_rows)
     first_places, known = places.of_first_frames(_GRID_FRAMES), float(places.measurements.num_measurements.sum())
     count = max(1, math.ceil(math.log(high / low) / GRID_STEP))
     sizes = [low * (high / low) ** (i / count) for i in range(count + 1)]
-    grid = sorted(direction * size for direction in directions for size in sizes)
+    grid = sorted(direction * size for direction in clock.directions for size in sizes)
     period, spacing = places.period, places.period
     blank = period - num_rows * high
     while spacing > max(0.7 * blank, 0.1 * period):

@@ -37,7 +37,7 @@ from rsvib_torch.detection.tones.uncertainty import linearised
 from rsvib_torch.detection.verdict import residual_reasons, with_remedy
 from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.timing import RowTiming
-from rsvib_torch.numerics.tables import Array, table, tensor
+from rsvib_torch.numerics.tables import Array, median, table, tensor
 from rsvib_torch.options import MAX_TONES, RegistrationOptions
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.results.presentation import AXIS_NAMES
@@ -50,6 +50,7 @@ MAX_STARTS = 5  # row times that are tried; of 8 random pairs of tones, 2 need a
 # Chi-square of the frequencies of tones per row and per frame at a row time. Of 78 recordings whose row time was within
 # the limits, at most 5.5 for the bands and 8.9 for the rows; of 5 with a wrong result within wrong limits, 32 and more
 _MAX_CONTRADICTION = 20.0
+_NOT_A_TONE = 0.1  # of the variance of the steps from frame to frame, which other motions leave beside one tone
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,8 @@ class RowTimeFit:
     exposure_time: float | None = None  # in s, measured from the blur; None if it was not
     exposure_std: float | None = None  # its standard deviation
     findings: tuple[Reason, ...] = ()  # reasons why the row time is not certain
+    # largest standard deviation over the row time of a certain result; frequencies have the same relative error
+    permitted: float = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,6 +286,12 @@ class CameraClock:
         exposure = exposure_time or self.exposure_time or size
         return RowTiming(size, exposure / size, max(self.period / size, self.num_rows))
 
+    def near(self, fit: RowTimeFit) -> "CameraClock":
+        """The clock with the row times that a fit allows only."""
+        size, reach = abs(fit.row_time), 4.0 * fit.std
+        low, high = max(self.low, size - reach), min(self.high, size + reach)
+        return replace(self, low=low, high=high, directions=(math.copysign(1.0, fit.row_time),))
+
     def allows(self, row_time: float) -> bool:
         """Whether a signed row time in s is possible."""
         return self.low <= abs(row_time) <= self.high and math.copysign(1.0, row_time) in self.directions
@@ -308,6 +317,25 @@ def bands_of_frames(
     of_rows, of_frames = table(rows.flatten(0, 1))[None], table(frames.double())[None]
     places = FramePlaces(measured, of_rows, of_frames, clock.period, clock.high)
     return curve, places
+
+
+def is_tone(curve: OffsetCurve) -> bool:
+    """Whether one tone on each axis may be the motion, by its steps from frame to frame; then it has other row times.
+
+    A tone above half of the frame rate continues from frame to frame as a slower one at another row time: one of 49.5
+    Hz at 30 frames per second and 40 us as one of 19.5 Hz at 101.5 us.
+    """
+    offsets = table(curve.offsets[0, ..., :2])
+    steps = np.nan_to_num(median(offsets, 1))
+    total = steps - steps.mean(0)
+    count = len(steps)
+    waves = np.exp(2j * math.pi * np.arange(0.02, 0.5, 0.2 / count) * np.arange(count)[:, None])
+    rest = total.copy()
+    for axis in range(2):
+        best = waves[:, np.argmax(np.abs(waves.T @ total[:, axis]))]
+        design = np.stack([np.ones(count), best.real, best.imag], -1)
+        rest[:, axis] -= design @ np.linalg.lstsq(design, total[:, axis])[0]
+    return bool(np.square(rest).sum() < _NOT_A_TONE * np.square(total).sum())
 
 
 def row_time_of_tones(

@@ -1,4 +1,4 @@
-"""Vibration followed frame by frame at the rate of a camera."""
+"""Vibration followed frame by frame at the rate of a camera, and the path of a camera."""
 
 import lazy_loader
 

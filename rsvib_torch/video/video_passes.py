@@ -35,8 +35,16 @@ from rsvib_torch.stacks.job import stored_frame
 from rsvib_torch.stacks.recorded_motion import compared_pairs
 from rsvib_torch.stacks.window_restoration import pair_verdict
 from rsvib_torch.stacks.windows import WindowRecord
+from rsvib_torch.tracking.camera_path import (
+    SIGNIFICANT,
+    WINDOW_FRAMES,
+    CameraPath,
+    Tone,
+    WindowPath,
+    camera_path,
+    shake,
+)
 from rsvib_torch.video import Margins
-from rsvib_torch.video.camera_path import SIGNIFICANT, WINDOW_FRAMES, CameraPath, Tone, WindowPath, camera_path, shake
 from rsvib_torch.video.recorded_rotation import RecordedRotation
 from rsvib_torch.video.steadying import steady_shifts
 from rsvib_torch.video.video_frames import Frame, FrameTrack, VideoFrames

@@ -14,7 +14,7 @@ from rsvib_torch.config import read_config
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.row_time.by_motion import row_time_of_splines
-from rsvib_torch.row_time.by_tones import FramePlaces
+from rsvib_torch.row_time.by_tones import CameraClock, FramePlaces
 
 HEIGHT, WIDTH, FRAMES = 192, 144, 5
 ROW_TIME, FRAME_ROWS = 6e-5, 240
@@ -140,7 +140,7 @@ def test_smooth_motion_continues_over_the_blanking_time(highest, known):
     information = np.broadcast_to(np.eye(2) / noise**2, (1, rows.shape[1], 2, 2))
     measured = Measurements(rows * 0.0, values - values.mean(2, keepdims=True), np.ones_like(rows), information, 1e-4)
     places = FramePlaces(measured, rows, frames, period, row_time)
-    found = row_time_of_splines(places, 256, 60e-6, period / 256, (1.0, -1.0))
+    found = row_time_of_splines(places, CameraClock(period, 256, 60e-6, period / 256, (1.0, -1.0), None))
     assert (found is not None) == known
     if found is not None:
         fit, _ = found

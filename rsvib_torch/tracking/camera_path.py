@@ -362,12 +362,18 @@ class _WindowFit:
         counts = [part.stop - part.start for part, *_ in self.pairs]
         return _robust_weights(distance, np.repeat(np.maximum(std, of_pairs), counts))
 
+    def add_tones(self, tones: Sequence[tuple[int, float]], slope: float = 0.0) -> None:
+        """Add tones of some axes and frequencies to those that ``solve`` fits."""
+        for axis, frequency in tones:
+            knots = np.zeros(self.envelope_knots, complex)
+            tone = WindowTone(axis, frequency, knots, self.start - self.origin, self.envelope_step, slope)
+            self.tones.append(tone)
+
     def with_tone(self, axis: int, frequency: float, slope: float) -> "_WindowFit":
         """The fit with one more tone."""
-        knots = np.zeros(self.envelope_knots, complex)
-        tone = WindowTone(axis, frequency, knots, self.start - self.origin, self.envelope_step, slope)
         other = copy(self)
-        other.tones, other.weights = [*map(copy, self.tones), tone], self.layer.astype(np.float64)
+        other.tones, other.weights = [*map(copy, self.tones)], self.layer.astype(np.float64)
+        other.add_tones([(axis, frequency)], slope)
         other.solve(1)
         return other
 
@@ -487,6 +493,24 @@ class _WindowFit:
         freedom = max(len(rest) - len(gram) - 3, 1)
         ratio = 0.5 * explained[best] / max((before - explained[best]) / freedom, 1e-12)
         return float(frequencies[best]), float(ratio), math.sqrt(explained[best] / float(total.sum()))
+
+
+def averaging(exposure: float, row_time: float, size: tuple[int, int]) -> Averaged:
+    """The times over which the displacement of a corner of frames (H, W) is a mean."""
+    return exposure, _PATCH_ROWS * reduction(*size) * row_time
+
+
+def distances_left(
+    corners: Corners, interval: float, averaged: Averaged, tones: Sequence[tuple[int, float]] = ()
+) -> Array:
+    """(N,) px, what a path and tones of given axes and frequencies (Hz) leave of the offsets of corners.
+
+    Other arguments are as in ``fit_window``.
+    """
+    fit = _WindowFit(corners, interval, averaged)
+    fit.add_tones(tones)
+    fit.solve(_ROUNDS)
+    return fit.distance
 
 
 def fit_window(
@@ -619,7 +643,7 @@ def camera_path(
     A ``ValueError`` is raised if no window of frames has corners in a quarter of its pairs.
     """
     readout = timing.row_time * size[int(timing.scan_axis)]
-    averaged = timing.exposure_time, _PATCH_ROWS * reduction(*size) * timing.row_time
+    averaged = averaging(timing.exposure_time, timing.row_time, size)
     allowed, windows = _UNEXPLAINED * reduction(*size), list[WindowPath]()
     waiting: list[Corners | None] = []
 

@@ -7,9 +7,9 @@ import pytest
 from scipy.ndimage import map_coordinates, spline_filter
 from truth import draw_scene
 
-from rsvib_torch import SensorTiming
+from rsvib_torch import SensorTiming, calibrate_row_time_by_motion
 from rsvib_torch.registration.corners import CornerFollower
-from rsvib_torch.video.camera_path import camera_path, shake
+from rsvib_torch.tracking.camera_path import camera_path, shake
 from rsvib_torch.video.steadying import largest_displacement, steady_shifts
 
 HEIGHT, WIDTH, COUNT, RATE, SAMPLES = 216, 288, 48, 30.0, 3
@@ -219,3 +219,25 @@ def test_the_smooth_path_keeps_slow_motion_and_the_limit():
     assert largest_displacement(shifts(2.0, 0.4), (HEIGHT, WIDTH)).max() > 0.03
     assert largest_displacement(shifts(2.0, 0.02), (HEIGHT, WIDTH)).max() <= 0.021
     assert not shifts(0.0, 0.1).any()
+
+
+@pytest.mark.parametrize("direction", ["forward", "reverse"])
+def test_the_path_of_a_hand_determines_the_row_time(direction):
+    """The frames have parallax, a subject, roll and zoom, and no vibration."""
+    frames = np.stack(recorded({}, count=32))
+    frames = frames if direction == "forward" else frames[:, ::-1]
+    found = calibrate_row_time_by_motion(frames, frame_rate=RATE)
+    assert found.reliable
+    assert found.readout_direction == direction
+    assert abs(found.row_time - TIMING.row_time) < 3 * found.row_time_std < 0.1 * TIMING.row_time
+
+
+def test_a_single_tone_does_not_determine_the_row_time():
+    """From frame to frame, 49.5 Hz are 10.5 Hz in the other direction, which a smooth path follows."""
+    shaken = [(4.0 * np.sin(2 * np.pi * 49.5 * (number / RATE + 40e-6 * np.arange(HEIGHT)))) for number in range(30)]
+    scene = spline_filter(draw_scene(HEIGHT, WIDTH, 3), order=3)
+    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)
+    at = (np.stack([y, x - moved[:, None]]) for moved in shaken)
+    frames = np.stack([map_coordinates(scene, place, order=3, prefilter=False, mode="nearest") for place in at])
+    found = calibrate_row_time_by_motion(np.clip(frames, 0, 1).astype(np.float32), frame_rate=RATE)
+    assert not found.reliable
