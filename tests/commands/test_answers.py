@@ -1,6 +1,7 @@
 """Every command ends with its answer, as text, as JSON or not at all; help, completion, progress, existing results."""
 
 import inspect
+import itertools
 import json
 import os
 import re
@@ -272,9 +273,10 @@ def test_long_operations_report_their_progress(place, tmp_path):
 
 
 def test_warnings_are_in_the_json_and_printed_quietly(place, config, tmp_path, capsys):
-    warning = "no vibration was found that can be removed: the frames are written unchanged"
-    for number, option in enumerate(("--json", "-q")):
-        assert rsvib("run", place / "still.tif", tmp_path / f"{number}", *config, option) == 0
+    commands = {"run": "the frames are written unchanged", "report": "the page has the input frames only"}
+    for (command, kept), option in itertools.product(commands.items(), ("--json", "-q")):
+        warning = f"no vibration was found that can be removed: {kept}"
+        assert rsvib(command, place / "still.tif", tmp_path / f"{command}{option}", *config, option) == 0
         shown = capsys.readouterr()
         assert shown.err == f"rsvib: warning: {warning}\n"
         assert shown.out == "" if option == "-q" else json.loads(shown.out)["warnings"] == [warning]

@@ -9,6 +9,7 @@ from scipy.special import j1
 from truth import MARGIN, Motion, draw_scene, take_frames
 
 from rsvib_torch import Optics, SensorNoise, SensorTiming, Vibration, simulate_frames
+from rsvib_torch.imaging import rows_showing
 
 TIMING = SensorTiming(row_time=60e-6, exposure_rows=20, frame_rows=300)
 MOTION = Motion((3.1, 5.2), (50.0, 30.0), (0.4, 1.3), (60.0, -25.0))
@@ -38,11 +39,14 @@ def test_channels_equal_singles_and_dtype_is_kept():
         torch.testing.assert_close(alone.double(), double, rtol=0, atol=1e-5)
 
 
-def test_default_frame_has_a_margin():
+def test_default_frame_has_a_margin_and_the_noise_of_the_generator():
     """The margin on every side is 16 px plus the amplitude."""
-    scene = torch.from_numpy(draw_scene(140, 140, 4))
-    frames = simulate_frames(scene, TIMING, Vibration([3.0, 5.0], [50.0, 30.0]))
+    scene, noise = torch.from_numpy(draw_scene(140, 140, 4)), SensorNoise(full_well=10000, read_noise=0.01)
+    vibration, generators = Vibration([3.0, 5.0], [50.0, 30.0]), [torch.Generator().manual_seed(n) for n in (1, 1, 2)]
+    frames, again, other = (simulate_frames(scene, TIMING, vibration, noise=noise, generator=g) for g in generators)
     assert frames.shape == (2, 140 - 2 * 21, 140 - 2 * 19)
+    assert torch.equal(frames, again)
+    assert not torch.equal(frames, other)
 
 
 def test_read_and_shot_noise_have_their_variance():
@@ -67,6 +71,17 @@ def test_quantisation(bits):
     assert counts.min() == 0
     assert counts.max() == levels
     assert (counts / levels - frames.clamp(0, 1)).abs().max() <= 0.5 / levels + 1e-12
+
+
+def test_rows_showing_is_the_fixed_point():
+    """Two and a half periods in an exposure: velocity and slope of the mean displacement differ."""
+    timing = SensorTiming(row_time=40e-6, exposure_rows=60, frame_rows=320).in_row_order()
+    vibration = Vibration([6.0, 5.0], [640.0, 1060.0], [0.3, -0.9])
+    rows, start = torch.arange(300.0, dtype=torch.float64), torch.tensor(timing.frame_period, dtype=torch.float64)
+    found = rows_showing(rows, start, timing, vibration)
+    mean = vibration.mean_displacement(start + found * timing.row_time, timing.exposure_time)[..., 1]
+    assert (found - rows - mean).abs().max() < 1e-6
+    assert (found - rows).abs().max() > 0.6
 
 
 FLAT = torch.full((3, 300, 400), 0.5, dtype=torch.float64)
