@@ -1,10 +1,9 @@
-"""A pinhole camera that turns, apart from the package: frames of a distant scene, and the rates of a gyroscope."""
+"""A camera that turns, apart from the package: frames of a distant scene, and the rates of a gyroscope."""
 
-import cv2
 import numpy as np
 import torch
 from benchmarks.independent_camera import exposed
-from field_truth import pixel_starts
+from field_truth import LensMotion, pixel_starts
 from scipy.ndimage import map_coordinates, spline_filter
 from scipy.spatial.transform import Rotation
 from truth import draw_scene
@@ -45,13 +44,12 @@ def take(timing, size=1.0, *, noise=0.003, dashboard=0, subject=None, count=COUN
     middle = (np.array(scene.shape[::-1]) - 1) / 2
     coefficients = spline_filter(scene, 5)
     row, column = np.mgrid[:height, :width].astype(float)
-    ray = np.stack([column - (width - 1) / 2, row - (height - 1) / 2, np.full_like(row, FOCAL_LENGTH)], -1)
-    if fisheye is not None:
-        normal = cv2.fisheye.undistortPoints(ray[..., :2].reshape(-1, 1, 2) / FOCAL_LENGTH, np.eye(3), fisheye)
-        ray[..., :2] = FOCAL_LENGTH * normal.reshape(height, width, 2)
+    points = np.stack([column - (width - 1) / 2, row - (height - 1) / 2], -1).reshape(-1, 2)
+    lens = {} if fisheye is None else {"distortion": fisheye, "fisheye": True}
+    rays = LensMotion(focal_length=FOCAL_LENGTH, **lens).rays(points)
 
     def seen_at(times):
-        seen = attitude(times.ravel(), size).apply(ray.reshape(-1, 3)).reshape(ray.shape)
+        seen = attitude(times.ravel(), size).apply(rays).reshape(height, width, 3)
         seen = FOCAL_LENGTH * seen[..., :2] / seen[..., 2:] + middle
         image = map_coordinates(coefficients, [seen[..., 1], seen[..., 0]], order=5, prefilter=False)
         if subject is not None:
@@ -74,6 +72,13 @@ def in_axes(orientation, of_camera):
     for axis, letter in enumerate(orientation):
         own[:, "xyz".index(letter.lower())] = of_camera[:, axis] * (1.0 if letter.isupper() else -1.0)
     return own
+
+
+def unrelated_rates(times):
+    """Rates (N, 3) of a smooth motion that is not that of the camera."""
+    noise = np.random.default_rng(4).standard_normal((len(times), 3))
+    smooth = np.stack([np.convolve(column, np.hanning(25) / 12, "same") for column in noise.T], -1)
+    return rsv.AngularRates(times, torch.from_numpy(0.3 * smooth))
 
 
 def recorded(orientation="XYZ", size=1.0, mirrored=1.0, count=COUNT):

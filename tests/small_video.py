@@ -1,9 +1,11 @@
 """Videos for tests: the small vibrating stack of ``small_stack.py`` with any times, orientation and sound."""
 
+import itertools
 from fractions import Fraction
 
 import av
 import numpy as np
+from skimage.registration import phase_cross_correlation
 from small_stack import MOTION, SCENE, TIMING
 from truth import Motion, take_frames
 
@@ -69,6 +71,21 @@ def write_clip(path, times, *, shown_at=None, **options):
     frames = np.repeat(draw_frames(times)[..., None], 3, axis=-1)
     options = {"codec": "libx264", "encoded": "yuv420p", "options": {"crf": "4"}, "sound": "aac", **options}
     write_video(path, frames, times if shown_at is None else shown_at, layout="rgb24", **options)
+
+
+def write_sharp(path, frames, times, **options):
+    """Write counts (T, H, W, 3) as H.264 with little loss; with threads, the pixels differ from run to run."""
+    encoder = {"crf": "6", "threads": "1", "tune": "zerolatency"}
+    settings = {"layout": "rgb24", "codec": "libx264", "encoded": "yuv420p", "options": encoder, "rate": 30}
+    write_video(path, frames, times, **settings | options)
+    return path
+
+
+def shifts(frames):
+    """(T - 1, 2) px, displacements (x, y) of the content of each grey frame against the one before."""
+    window = np.hanning(frames.shape[-2])[:, None] * np.hanning(frames.shape[-1])
+    pairs = itertools.pairwise((frame - frame.mean()) * window for frame in frames)
+    return -np.array([phase_cross_correlation(a, b, upsample_factor=50, normalization=None)[0][::-1] for a, b in pairs])
 
 
 def sound_of(path):

@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import fields, is_dataclass
+from functools import partial
 
 import numpy as np
 import pytest
@@ -65,6 +66,10 @@ def offset_curve(pairs, rows, times, offsets):
     return rsv.OffsetCurve(pairs, rows, times, times, offsets, offsets[..., 0], (2, 2))
 
 
+FLICKER = 0.4 + 0.2 * torch.cos(0.4 * torch.arange(256.0)).repeat(2, 16, 1).mT
+HARD = {"joint": True, "prior": "edges", "saturation": 0.9}
+detect = partial(rsv.detect_vibration, timing=TIMING)
+restore = partial(rsv.restore, timing=TIMING, vibration=VIBRATION)
 # The function, and its arguments that are arrays.
 CASES = (
     {
@@ -78,7 +83,7 @@ CASES = (
             torch.tensor([[0, 1]]),
             PAIR[0],
             PAIR.double(),
-            PAIR[:, None].repeat(1, 2, 1).double(),
+            PAIR[:, None].expand(1, 2, 2).double(),
         ),
         "RollingShutterVibration": (rsv.RollingShutterVibration(TIMING), FRAMES[:, None]),
         "RollingShutterVibration, p=0": (rsv.RollingShutterVibration(TIMING, p=0.0), FRAMES[:, None]),
@@ -93,23 +98,12 @@ CASES = (
         "VibrationRestorer": (lambda frames: rsv.VibrationRestorer(TIMING, method="dewarp")(frames, STILL), FRAMES),
         "VibrationTracker": (lambda *frames: tracked(*frames, window=3), *FRAMES),
         "VibrationTracker, steady": (lambda *frames: tracked(*frames, window=3, steady=1.0), *FRAMES),
-        "calibrate_row_time": (
-            lambda frames: rsv.calibrate_row_time(frames, 1000.0),
-            0.4 + 0.2 * torch.cos(0.4 * torch.arange(256.0)).repeat(2, 16, 1).mT,
-        ),
-        "detect_vibration": (lambda frames: rsv.detect_vibration(frames, TIMING), FRAMES),
-        "detect_vibration, ignore": (
-            lambda frames, ignore: rsv.detect_vibration(frames, TIMING, ignore=ignore),
-            FRAMES,
-            FRAMES > 0.95,
-        ),
+        "calibrate_row_time": (lambda frames: rsv.calibrate_row_time(frames, 1000.0), FLICKER),
+        "detect_vibration": (detect, FRAMES),
+        "detect_vibration, ignore": (lambda frames, ignore: detect(frames, ignore=ignore), FRAMES, FRAMES > 0.95),
         "find_slanted_edges": (rsv.find_slanted_edges, EDGE),
         "slanted_edge_mtf": (rsv.slanted_edge_mtf, EDGE),
-        "judge_restoration": (
-            lambda frames, restored: rsv.judge_restoration(frames, restored, TIMING, VIBRATION),
-            FRAMES,
-            FRAMES,
-        ),
+        "judge_restoration": (partial(rsv.judge_restoration, timing=TIMING, vibration=VIBRATION), FRAMES, FRAMES),
         "psnr": (lambda *images: rsv.psnr(*images, 1.0), FRAMES, FRAMES.flip(0)),
         "ssim": (lambda *images: rsv.ssim(*images, 1.0), FRAMES, FRAMES.flip(0)),
         "row_psf": (lambda starts: rsv.row_psf(STILL, starts, TIMING), TIMES[:8]),
@@ -132,39 +126,24 @@ CASES = (
             lambda frames: rsv.detect_swept_tone(np.stack([frames, frames])[:, :, None], TIMING)[1],
             FRAMES,
         ),
-        "detect_vibration, bands": (
-            lambda frames: rsv.detect_vibration(frames, TIMING, method="bands", harmonics=2),
-            FRAMES,
-        ),
+        "detect_vibration, bands": (partial(detect, method="bands", harmonics=2), FRAMES),
         "check_motion": (lambda frames: rsv.check_motion(frames, TIMING, MOTION), FRAMES),
         "align_motion": (lambda frames: rsv.align_motion(frames, TIMING, MOTION, offsets=(-0.002, 0.002)), FRAMES),
         "restoration_mtf": (lambda frames: rsv.restoration_mtf(frames, TIMING, VIBRATION, joint=True, scale=2), FRAMES),
-        "restore, holes": (
-            lambda frames, ignore: rsv.restore(
-                frames, TIMING, VIBRATION, ignore=ignore, joint=True, prior="edges", saturation=0.9
-            ),
-            FRAMES,
-            FRAMES > 0.8,
-        ),
+        "restore, holes": (lambda frames, ignore: restore(frames, ignore=ignore, **HARD), FRAMES, FRAMES > 0.8),
         "RowVaryingBlur.A_adjoint": (rsv.RowVaryingBlur(PSF).A_adjoint, FRAMES[0, :8]),
         "restore_block": (lambda frames: rsv.restore_block(np.asarray(frames), TIMING), FRAMES),
-        "restore, no axis": (lambda frames: rsv.restore(frames, TIMING, REFUSED), FRAMES),
-        "restore, no axis, last": (
-            lambda frames: rsv.restore(frames, TIMING, REFUSED, channels="last"),
-            FRAMES[..., None],
-        ),
-        "restore, mosaic": (lambda frames: rsv.restore(frames, TIMING, REFUSED, mosaic="RGGB"), FRAMES),
+        "restore, no axis": (partial(restore, vibration=REFUSED), FRAMES),
+        "restore, no axis, last": (partial(restore, vibration=REFUSED, channels="last"), FRAMES[..., None]),
+        "restore, mosaic": (partial(restore, vibration=REFUSED, mosaic="RGGB"), FRAMES),
     }
     | {
-        f"restore, {method}, {name}": (
-            lambda frames, m=method, v=motion: rsv.restore(frames, TIMING, v, method=m),
-            FRAMES,
-        )
+        f"restore, {method}, {name}": (partial(restore, vibration=motion, method=method), FRAMES)
         for method in ("exact", "banded", "dewarp", "richardson-lucy")
         for name, motion in (("moving", VIBRATION), ("still", STILL))
     }
     | {
-        f"register_bands, {method}": (lambda frames, m=method: rsv.register_bands(frames, TIMING, method=m), FRAMES)
+        f"register_bands, {method}": (partial(rsv.register_bands, timing=TIMING, method=method), FRAMES)
         for method in ("ncc", "phase", "projection")
     }
 )

@@ -99,10 +99,7 @@ VIBRATION = "[simulation.vibration]\namplitude = [1, 2]\nfrequency = [40, 30]\n"
         (SENSOR + "[detection]\nband_rows = 32.5", "detection.band_rows must be a whole number, got 32.5"),
         (SENSOR + "[detection]\ntones = 'few'", "detection.tones must be"),
         (SENSOR + "[restoration]\nmethod = 'magic'", "restoration.method must be '"),
-        (
-            SENSOR + "[restoration]\nmethod = 'banded'\nhalf_row = 1",
-            "unknown option 'restoration.half_row'; ",
-        ),
+        (SENSOR + "[restoration]\nmethod = 'banded'\nhalf_row = 1", "unknown option 'restoration.half_row'; "),
         (SENSOR + "[simulation]\nseed = 1", "simulation.vibration is missing; expected a table with amplitude, freq"),
         (SENSOR + VIBRATION.replace("[1, 2]", "[-1, 2]"), "simulation.vibration: amplitude must not be negative, got"),
         (

@@ -141,20 +141,6 @@ def test_valid_shapes_are_accepted(shape, channels):
     assert torch.equal(prepared.from_row_order(prepared.images), frames)
 
 
-@pytest.mark.parametrize(
-    ("shape", "channels", "message"),
-    [
-        ((2, 48, 64, 1), None, r"pass channels=\"last\" or frames.permute\(0, 3, 1, 2\), or channels=\"first\" if"),
-        ((48, 64, 3), "last", r"one image \(H, W, C\): pass frames\[None\] with channels=\"last\""),
-        ((48, 64, 1), None, r"or channels=\"first\" if these are 48 frames of 64 x 1 px"),
-        ((2, 3, 48, 64), "last", r"appear to have their channels before the image axes: omit channels=\"last\""),
-        ((8, 2, 48, 64), None, r"appear to be a batch \(B, T, H, W\): pass frames\[:, :, None\]"),
-    ],
-)
-def test_shapes_that_are_refused(shape, channels, message):
-    refuses(lambda: prepare_frames(torch.rand(shape), TIMING, channels=channels), message)
-
-
 def test_lists_are_stacked(grey, colour):
     expected = dewarp(grey, TIMING, VIBRATION)
     lists = {
@@ -171,21 +157,6 @@ def test_lists_are_stacked(grey, colour):
     last = [frame.permute(1, 2, 0).numpy() for frame in colour]
     assert dewarp(last, TIMING, VIBRATION, channels="last").shape == (3, 284, 202, 3)
     assert as_tensor("frames", [list(grey), list(grey)]).shape == (2, 3, 284, 202)
-
-
-@pytest.mark.parametrize(
-    ("frames", "error", "message"),
-    [
-        ([torch.zeros(5, 7), torch.zeros(5, 6)], ValueError, r"frames\[1\] is \(5, 6\) float32 on cpu and frames\[0\]"),
-        ([np.zeros((5, 7)), np.zeros((5, 7), np.uint8)], ValueError, r"frames\[1\] is \(5, 7\) uint8 on cpu and"),
-        ([torch.zeros(5, 7), "b.png"], TypeError, r"frames\[1\] must be a tensor or array of numbers, got str; read"),
-        ([], ValueError, r"frames must have shape .* got \(0,\)"),
-        ((frame for frame in torch.zeros(2, 5, 7)), TypeError, "got generator; pass a list"),
-        (torch.zeros(5, 7), ValueError, r"got \(5, 7\); one grey image is frames\[None\]"),
-    ],
-)
-def test_lists_that_are_refused(frames, error, message):
-    refuses(lambda: dewarp(frames, TIMING, VIBRATION), message, error)
 
 
 def test_files_are_read(grey, tmp_path):
@@ -237,25 +208,5 @@ def test_frames_on_another_axis_are_refused_with_the_order_of_the_axes(shape, or
     assert rsv.restore(frames, TIMING, rsv.Vibration.still(), channels="first").shape == shape
 
 
-def test_one_frame_of_several_channels_is_explained():
-    """A stack of three or four grey frames that tifffile.imwrite has written is one colour image."""
-    with pytest.raises(
-        ValueError,
-        match=r"at least 2 frames are needed, got 1 of 4 channels; store grey.*grey stacks is \(B, T, 1, H, W\)",
-    ):
-        rsv.detect_vibration(torch.rand(1, 4, 96, 96), TIMING)
-
-
-def test_augmentation_refuses_channels_last():
-    augmentation = rsv.RollingShutterVibration(TIMING)
-    for shape in ((2, 48, 64, 3), (48, 64, 3)):
-        with pytest.raises(ValueError, match=r"appear to have their channels last: pass images.movedim\(-1, -3\)"):
-            augmentation(torch.rand(shape))
-
-
-def test_copies_of_frames_are_named(grey):
-    """A converter that repeats a frame changes the time of all following ones."""
-    with pytest.raises(ValueError, match="frames 1 and 2 are identical: one of them is a copy"):
-        rsv.detect_vibration(grey[[0, 1, 1, 2]], TIMING)
-    still = rsv.detect_vibration(grey[[0, 0, 0]], TIMING)  # a camera at rest
-    assert not still.reliable.any()
+def test_equal_frames_are_those_of_a_camera_at_rest(grey):
+    assert not rsv.detect_vibration(grey[[0, 0, 0]], TIMING).reliable.any()

@@ -9,7 +9,7 @@ import pytest
 
 import rsvib_torch as rsv
 from rsvib_torch.checks.validation import MistakesError, validate
-from rsvib_torch.options import RestorationOptions, ToneOptions
+from rsvib_torch.options import ToneOptions
 
 
 @pytest.mark.parametrize(
@@ -39,27 +39,6 @@ def test_values_are_kept_or_refused_but_not_converted():
     for value, error in ((2.0, TypeError), ("2", TypeError), (True, TypeError), (5, ValueError)):
         with pytest.raises(error, match="tones must be"):
             ToneOptions(tones=value)
-
-
-@pytest.mark.parametrize(
-    ("values", "error", "message"),
-    [
-        ({"half_row": 2}, TypeError, "unknown option 'half_row'; the options are joint"),
-        (
-            {"method": "dewarp", "half_rows": 2},
-            ValueError,
-            "half_rows is no option of method='dewarp'; its",
-        ),
-        ({"noise": -1.0}, ValueError, r"noise must be at least 0, got -1.0 \(float\)"),
-        ({"method": "richardson-lucy", "iterations": 10**9}, ValueError, "iterations must be at most 1000, got"),
-        ({"interpolation": "linea"}, ValueError, "interpolation must be 'linear' or 'cubic', got 'linea'"),
-        ({"optics": {"sigma": "wide"}}, TypeError, "optics.sigma must be a number, got 'wide'"),
-        ({"optics": {"width": 1.0}}, TypeError, "unknown option 'optics.width'; the options are sigma, cutoff"),
-    ],
-)
-def test_mistakes_have_name_value_and_remedy(values, error, message):
-    with pytest.raises(error, match=message):
-        RestorationOptions(**values)
 
 
 def test_tables_of_files_have_one_line_for_each_mistake():

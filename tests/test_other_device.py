@@ -14,6 +14,7 @@ SIZE = 128
 TIMING = rsv.SensorTiming(row_time=20.52e-6 * 16, exposure_rows=2, frame_rows=SIZE)
 LONG = replace(TIMING, exposure_rows=24)
 SHAKE = rsv.Vibration([1.6, 2.1], [50.0, 30.0], [0.4, 1.1])
+FREE = rsv.FreeMotion(torch.zeros(2, 40), 0.0, 0.01, SHAKE)
 TOLERANCE = 1e-4  # of full scale
 
 
@@ -87,6 +88,8 @@ WORK = {
     "holes": lambda images, timing: rsv.restore(with_missing(images), timing, SHAKE),
     "saturated": lambda images, timing: rsv.restore(images.clamp(max=0.6), timing, SHAKE, saturation=0.6),
     "dewarp": lambda images, timing: rsv.restore(images, timing, SHAKE, method="dewarp"),
+    "module": lambda images, timing: rsv.VibrationRestorer(timing, method="dewarp")(images, SHAKE),
+    "module, motion of the CPU": lambda images, timing: rsv.VibrationRestorer(timing, method="dewarp")(images, FREE),
     "richardson-lucy": lambda frames, timing: rsv.restore(
         frames, timing, SHAKE, method="richardson-lucy", iterations=5
     ),
@@ -115,17 +118,6 @@ def test_results_stay_on_the_device_and_are_those_of_the_cpu(name):
         found = there[key].as_subclass(torch.Tensor)
         scale = max(1.0, float(expected.detach().double().nan_to_num().abs().amax()))
         torch.testing.assert_close(found, expected, rtol=0.0, atol=TOLERANCE * scale, equal_nan=True)
-
-
-@pytest.mark.parametrize("model", ["vibration", "motion"])
-def test_modules_compute_on_the_device_of_their_frames(model):
-    images = frames()
-    module = rsv.VibrationRestorer(TIMING, method="dewarp")
-    motion = SHAKE if model == "vibration" else rsv.FreeMotion(torch.zeros(2, 40), 0.0, 0.01, SHAKE)
-    with simulated_gpu():
-        restored = module(images.to(SIMULATED_GPU), motion)
-    assert isinstance(restored, SimulatedGpuTensor)
-    torch.testing.assert_close(restored.as_subclass(torch.Tensor), module(images, motion), rtol=0, atol=1e-5)
 
 
 @pytest.mark.filterwarnings("ignore::rsvib_torch.RestorationWarning")

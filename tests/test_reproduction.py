@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from benchmark import parsed
 from benchmarks import reproduction
-from benchmarks.reproduction import AMPLITUDE, DETECTED, PERIOD, straight_edge_mtf
+from benchmarks.reproduction import straight_edge_mtf
 from edge_truth import draw_edge, gaussian, through_pixels
 
 
@@ -20,13 +20,6 @@ def test_straight_edge_mtf(angle):
         np.testing.assert_allclose(found, truth, rtol=0, atol=0.012)
     bent = np.stack([np.roll(row, round(3 * math.sin(i / 12))) for i, row in enumerate(roi)])
     assert straight_edge_mtf(bent, frequency)[25] < 0.7 * truth[25]
-
-
-def test_percentages_of_the_paper_agree_with_its_values():
-    for lines in DETECTED.values():
-        for axis, line in lines.items():
-            assert line.period_error == pytest.approx(100 * abs(line.period / PERIOD[axis] - 1), abs=0.015)
-            assert line.amplitude_error == pytest.approx(100 * abs(line.amplitude / AMPLITUDE[axis] - 1), abs=0.015)
 
 
 def test_small_run():

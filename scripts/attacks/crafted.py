@@ -36,16 +36,6 @@ CASES: dict[str, Case] = {}
 _FILES = {"npy": "a.npy", "PNG": "a.png", "JPEG": "a.jpg", "TIFF": "a.tif"}
 
 
-def case(name: str) -> Callable[[Case], Case]:
-    """Add a case."""
-
-    def add(write: Case) -> Case:
-        CASES[name] = write
-        return write
-
-    return add
-
-
 def _data(name: str, data: str | bytes, folder: Path) -> Path:
     path = folder / name
     path.write_bytes(data.encode() if isinstance(data, str) else data)
@@ -61,6 +51,18 @@ def _sparse(name: str, head: bytes, size: int, folder: Path) -> Path:
     """A file of a large size of which only the beginning is on the disk."""
     path = _data(name, head, folder)
     os.truncate(path, size)
+    return path
+
+
+def _special(name: str, target: str, folder: Path) -> Path:
+    """A pipe, or a link to a target, which takes the place of what has this name."""
+    path = folder / name
+    if path.exists():
+        path.rename(folder / "moved")
+    if target:
+        path.symlink_to(target)
+    else:
+        os.mkfifo(path)
     return path
 
 
@@ -130,7 +132,6 @@ CASES["JPEG: sparse file of 6 GB"] = partial(_sparse, "a.jpg", b"\xff\xd8\xff\xe
 CASES["PNG: 30000 x 30000 px in 1 MB"] = lambda folder: _data("a.png", _png(30000, 30000, pixels=30001 * 30000), folder)
 
 
-@case("PNG: folder of 200 bombs")
 def _png_folder(folder: Path) -> Path:
     (folder / "frames").mkdir()
     bomb = _png(12000, 12000, pixels=12001 * 12000)
@@ -139,6 +140,7 @@ def _png_folder(folder: Path) -> Path:
     return folder / "frames"
 
 
+CASES["PNG: folder of 200 bombs"] = _png_folder
 _case_of(
     "PNG: text that expands to 1 GB",
     _png(16, 16, more=_chunk(b"zTXt", b"a\0\0" + zlib.compress(bytes(10**7), 9) * 100)),
@@ -251,7 +253,6 @@ CASES["TIFF: 60000 pages"] = partial(_tiff_pages, count=60_000)
 CASES["TIFF: 20000 pages and thumbnails of different sizes"] = partial(_tiff_pages, count=20_000, alternating=True)
 
 
-@case("TIFF: 1 MB that expands to 3.6 GB")
 def _tiff_bomb(folder: Path) -> Path:
     packer = zlib.compressobj(9)
     packed = b"".join(packer.compress(bytes(9 * 10**6)) for _ in range(100)) + packer.flush()
@@ -260,11 +261,12 @@ def _tiff_bomb(folder: Path) -> Path:
     return _data("a.tif", (b"II*\0" + struct.pack("<I", 8) + pages).ljust(512, b"\0") + packed, folder)
 
 
-@case("TIFF: axes YXT, zlib, expands to 2.4 GB")
 def _tiff_yxt(folder: Path) -> Path:
     write_tiff(folder / "a.tif", np.zeros((3000, 2000, 200), np.uint16), metadata={"axes": "YXT"}, compression="zlib")
     return folder / "a.tif"
 
+
+CASES |= {"TIFF: 1 MB that expands to 3.6 GB": _tiff_bomb, "TIFF: axes YXT, zlib, expands to 2.4 GB": _tiff_yxt}
 
 # --- HDF5 ---------------------------------------------------------------------------------------------------------
 
@@ -348,27 +350,18 @@ CASES["Zarr: unknown codec"] = partial(_zarr, codecs=[{"name": "pickle"}])
 CASES["Zarr: attribute of 20 MB"] = partial(_zarr, attributes={"axes": "T" * (20 * 10**6)})
 for _header in ("[" * _DEEP, '{"a":' * _DEEP, '{"shape": ' + "9" * 10**6 + "}"):
     CASES[f"Zarr: header {_header[:15]}"] = lambda folder, text=_header: _data("zarr.json", text, _zarr(folder)).parent
-CASES["Zarr: header is a pipe"] = lambda folder: _piped(_zarr(folder), "zarr.json")
-CASES["Zarr: chunk is a pipe"] = lambda folder: _piped(_zarr(folder), "c/0/0/0")
-CASES["Zarr: chunk is a link to a device"] = lambda folder: _linked(_zarr(folder), "c/0/0/0", "/dev/urandom")
-CASES["Zarr: folder linked to itself"] = lambda folder: _linked(_zarr(folder), "c/1", ".")
 
 
-def _piped(path: Path, name: str) -> Path:
-    (path / name).unlink()
-    os.mkfifo(path / name)
+def _special_in_zarr(name: str, target: str, folder: Path) -> Path:
+    path = _zarr(folder)
+    _special(name, target, path)
     return path
 
 
-def _linked(path: Path, name: str, target: str) -> Path:
-    place = path / name
-    if place.is_dir():
-        place.rename(path / "moved")
-    else:
-        place.unlink()
-    place.symlink_to(target)
-    return path
-
+CASES["Zarr: header is a pipe"] = partial(_special_in_zarr, "zarr.json", "")
+CASES["Zarr: chunk is a pipe"] = partial(_special_in_zarr, "c/0/0/0", "")
+CASES["Zarr: chunk is a link to a device"] = partial(_special_in_zarr, "c/0/0/0", "/dev/urandom")
+CASES["Zarr: folder linked to itself"] = partial(_special_in_zarr, "c/1", ".")
 
 # --- Video --------------------------------------------------------------------------------------------------------
 
@@ -391,7 +384,6 @@ def _video(name: str, size: tuple[int, int], count: int, folder: Path) -> Path:
 CASES["video: 12000 x 12000 px"] = partial(_video, "a.mkv", (12000, 12000), 4)
 
 
-@case("video: .mkv that states 65535 x 65535 px")
 def _video_large(folder: Path) -> Path:
     path = _video("a.mkv", (64, 64), 4, folder)
     data = path.read_bytes()
@@ -399,7 +391,6 @@ def _video_large(folder: Path) -> Path:
     return _data("a.mkv", data, folder)
 
 
-@case("video: .mp4 that states 2^32 - 1 samples")
 def _video_samples(folder: Path) -> Path:
     data = bytearray(_video("a.mp4", (64, 64), 8, folder).read_bytes())
     for box in (b"stsz", b"stts", b"stco", b"ctts"):
@@ -409,7 +400,6 @@ def _video_samples(folder: Path) -> Path:
     return _data("a.mp4", bytes(data), folder)
 
 
-@case("video: .avi that states 2^32 - 1 frames")
 def _video_frames(folder: Path) -> Path:
     data = bytearray(_video("a.avi", (64, 64), 4, folder).read_bytes())
     place = data.index(b"avih") + 8
@@ -417,6 +407,9 @@ def _video_frames(folder: Path) -> Path:
     return _data("a.avi", bytes(data), folder)
 
 
+CASES["video: .mkv that states 65535 x 65535 px"] = _video_large
+CASES["video: .mp4 that states 2^32 - 1 samples"] = _video_samples
+CASES["video: .avi that states 2^32 - 1 frames"] = _video_frames
 CASES["video: playlist"] = partial(_data, "a.mp4", "#EXTM3U\n/dev/urandom\n")
 CASES["video: list of files"] = partial(_data, "a.mkv", "ffconcat version 1.0\nfile /dev/urandom\n")
 CASES["video: zeros"] = partial(_sparse, "a.mp4", b"", 10**9)
@@ -425,27 +418,18 @@ CASES["video: zeros after a header of .ts"] = partial(_sparse, "a.mts", b"G" + b
 # --- Pipes, devices, links ----------------------------------------------------------------------------------------
 
 
-def _special(name: str, target: str, folder: Path) -> Path:
-    """A pipe, or a link to a device or a file of the system."""
-    if target:
-        (folder / name).symlink_to(target)
-    else:
-        os.mkfifo(folder / name)
-    return folder / name
-
-
 for _ending in (".tif", ".png", ".npy", ".h5", ".raw", ".mp4", ".toml", ".csv", ".vibration.json"):
     for _name, _target in (("pipe", ""), ("device", "/dev/urandom")):
         CASES[f"{_name} {_ending}"] = partial(_special, f"a{_ending}", _target)
 
 
-@case("pipe in a folder of images")
 def _pipe_in_folder(folder: Path) -> Path:
     (folder / "frames").mkdir()
     _data("frames/a.png", _png(16, 16, pixels=17 * 16), folder)
-    os.mkfifo(folder / "frames" / "b.png")
-    return folder / "frames"
+    return _special("b.png", "", folder / "frames").parent
 
+
+CASES["pipe in a folder of images"] = _pipe_in_folder
 
 # --- Configuration, motion, vibration, manifest -------------------------------------------------------------------
 

@@ -9,11 +9,12 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -30,12 +31,13 @@ _LONGEST_END = 20.0  # s from a signal to the end, which takes 1 to 3 s on an id
 _CAMERA = ("--row-time", "200us", "--exposure", "0.8ms", "--frame-rate", str(_RATE))
 
 
-class _Camera(ThreadingHTTPServer):
+class StreamingCamera(ThreadingHTTPServer):
     """Motion JPEG over HTTP; after its frames it ``disappears``, or keeps the connection and sends nothing."""
 
-    def __init__(self, frames: int, *, disappears: bool = True) -> None:
+    def __init__(self, frames: int, *, disappears: bool = True, pictures: Sequence[Any] = ()) -> None:
         scene = cv2.blur(np.random.default_rng(0).integers(0, 256, (_SIZE, _SIZE), np.uint8), (5, 5))
-        self.parts = [cv2.imencode(".jpg", np.roll(scene, (n // 3, n), (0, 1)))[1].tobytes() for n in range(8)]
+        shown = pictures or [np.roll(scene, (n // 3, n), (0, 1)) for n in range(8)]
+        self.parts = [cv2.imencode(".jpg", picture)[1].tobytes() for picture in shown]
         self.frames, self.disappears = frames, disappears
         self.viewers = threading.Semaphore(0)  # released when a viewer has connected
         self.begin, self.end = threading.Event(), threading.Event()  # of the first frame, and of the need for a camera
@@ -47,7 +49,7 @@ class _Camera(ThreadingHTTPServer):
 class _Stream(BaseHTTPRequestHandler):
     """The answer to a viewer."""
 
-    server: _Camera
+    server: StreamingCamera
 
     def do_GET(self) -> None:
         """Send frames until the camera ends or the viewer leaves."""
@@ -56,9 +58,9 @@ class _Stream(BaseHTTPRequestHandler):
         self.end_headers()
         self.server.viewers.release()
         self.server.begin.wait()
-        for index in range(self.server.frames):
+        for _, part in zip(range(self.server.frames), cycle(self.server.parts), strict=False):
             try:
-                self.wfile.write(b"--part\r\nContent-Type: image/jpeg\r\n\r\n" + self.server.parts[index % 8] + b"\r\n")
+                self.wfile.write(b"--part\r\nContent-Type: image/jpeg\r\n\r\n" + part + b"\r\n")
             except OSError:
                 return
             time.sleep(1 / _RATE)
@@ -70,9 +72,9 @@ class _Stream(BaseHTTPRequestHandler):
 
 
 @contextmanager
-def _camera(*, frames: int = 10**6, begins: bool = False, disappears: bool = True) -> Iterator[_Camera]:
+def streaming_camera(*, frames: int = 10**6, begins: bool = False, **options: Any) -> Iterator[StreamingCamera]:
     """A running camera; if it ``begins``, it does not wait for the event."""
-    with _Camera(frames, disappears=disappears) as camera:
+    with StreamingCamera(frames, **options) as camera:
         threading.Thread(target=camera.serve_forever, daemon=True).start()
         if begins:
             camera.begin.set()
@@ -186,7 +188,7 @@ class _Ending:
 
     def __call__(self, name: str, out: Path, frames: int) -> Trial:
         """A trial."""
-        with _camera(begins=True) as camera:
+        with streaming_camera(begins=True) as camera:
             session = _start(camera.url, out, self.output)
             count = session.recorded(frames)
             if session.child.poll() is None:
@@ -207,7 +209,7 @@ def _without_reader(session: _Session) -> None:
 
 def _killed(name: str, out: Path, frames: int) -> Trial:
     """SIGKILL; the next session of the same name is refused, and names the recording."""
-    with _camera(begins=True) as camera:
+    with streaming_camera(begins=True) as camera:
         session = _start(camera.url, out)
         count = session.recorded(frames)
         session.child.kill()
@@ -219,7 +221,7 @@ def _killed(name: str, out: Path, frames: int) -> Trial:
 
 def _camera_ends(name: str, out: Path, frames: int, *, disappears: bool) -> Trial:
     """The camera disappears, which ends the session, or sends nothing more until SIGTERM arrives."""
-    with _camera(frames=frames, begins=True, disappears=disappears) as camera:
+    with streaming_camera(frames=frames, begins=True, disappears=disappears) as camera:
         session, least = _start(camera.url, out), frames - _WAITING
         if not disappears:
             session.recorded(least)
@@ -230,7 +232,7 @@ def _camera_ends(name: str, out: Path, frames: int, *, disappears: bool) -> Tria
 
 def _before_the_first_frame(name: str, out: Path, frames: int) -> Trial:
     """SIGINT while OpenCV waits for the first frame."""
-    with _camera() as camera:
+    with streaming_camera() as camera:
         session = _start(camera.url, out)
         camera.viewers.acquire(timeout=_LIMIT)
         time.sleep(0.5)

@@ -14,12 +14,14 @@ from typing_extensions import TypeAliasType
 import rsvib_torch as rsv
 from rsvib_torch.checks.values import members_of
 from rsvib_torch.datasets import city_and_fields
+from rsvib_torch.results.reason import Reason
 
 TIMING = rsv.SensorTiming(1e-4, 6, 104)
 LONG = rsv.SensorTiming(1e-4, 6, 104, frame_start_times=[0.0, 2.0])
 BANDS = {"band_rows": 16, "band_step": 8, "search": 6}
 CURVES = (torch.zeros(1), torch.zeros(1, 2), torch.zeros(1, 2))  # times, offsets, residual of a MotionCheck
 FRAMES = torch.rand(2, 96, 64, generator=torch.Generator().manual_seed(0))
+RGB = FRAMES[:, None].repeat(1, 3, 1, 1)
 WIDE = torch.rand(2, 96, 128, generator=torch.Generator().manual_seed(0))
 VIBRATION = rsv.Vibration([1.0, 0.5], [130.0, 170.0])
 STARTS = TIMING.row_starts(1, 96)[0]
@@ -48,6 +50,31 @@ def detect(frames, **options):
     return rsv.detect_vibration(frames, TIMING, **options)
 
 
+def augment(images=None, **options):
+    augmentation = rsv.RollingShutterVibration(TIMING, **options)
+    return augmentation.drawn_vibration() if images is None else augmentation(images)
+
+
+def dewarp(**changes):
+    return rsv.FixedDewarp(**{"timing": TIMING, "vibration": VIBRATION, "size": (96, 64), "num_frames": 2} | changes)
+
+
+def free(coefficients, *tones):
+    return rsv.FreeMotion(coefficients, 0.0, 1e-3, *tones)
+
+
+def simulate(scene, vibration=VIBRATION, **options):
+    return rsv.simulate_frames(scene, TIMING, vibration, **options)
+
+
+def by_motion(**options):
+    return rsv.calibrate_row_time_by_motion(FRAMES, frame_rate=90.0, **options)
+
+
+def flicker(frames, frequency=1000.0, **options):
+    return rsv.calibrate_row_time(frames, frequency, **options)
+
+
 def judge(frames, vibration=VIBRATION):
     return rsv.judge_restoration(frames, FRAMES, TIMING, vibration)
 
@@ -61,8 +88,16 @@ def bound(scene=None, frame_size=(80, 40)):
     return rsv.evaluation.cramer_rao_bound(scene, TIMING, VIBRATION, noise=0.01, frame_size=frame_size)
 
 
+def restore(**options):
+    return rsv.restore(FRAMES, TIMING, VIBRATION, **options)
+
+
+def dewarped(*shape, channels=None):
+    return rsv.restore(torch.rand(shape), TIMING, VIBRATION, method="dewarp", channels=channels)
+
+
 def sharpened(optics):
-    return rsv.restore(FRAMES, TIMING, VIBRATION, optics=optics)
+    return restore(optics=optics)
 
 
 def nested():
@@ -107,36 +142,24 @@ def test_pixels_beyond_all_scales(value):
         (lambda: TIMING.row_starts(2, 2**63), "num_rows must be at most"),
         (lambda: TIMING.frame_starts(2, "nowhere"), "device='nowhere' is not available"),
         (lambda: rsv.Vibration(1e300, 50.0), "amplitude must be at most 1e"),
-        (
-            lambda: rsv.FreeMotion(torch.full((2, 9), 1e300, dtype=torch.float64), 0.0, 1e-3),
-            "coefficients must be at most",
-        ),
+        (lambda: free(1e300 * torch.ones(2, 9).double()), "coefficients must be at most"),
         (lambda: VIBRATION.displacement("now"), r"times must be an instance of Tensor, got 'now' \(str\)"),
-        (lambda: rsv.FreeMotion(torch.zeros(2, 9), 0.0, 1e-3).mean_displacement(torch.zeros(3), 1e9), "exposure_time"),
+        (lambda: free(torch.zeros(2, 9)).mean_displacement(torch.zeros(3), 1e9), "exposure_time"),
         (lambda: rsv.restore(FRAMES, "timing", VIBRATION), "timing must be a SensorTiming"),
         (lambda: rsv.restore(FRAMES, TIMING, 3), r"vibration must be a Motion or a DetectedVibration \(from .*\),"),
         (lambda: rsv.row_psf(VIBRATION, torch.tensor([math.inf]), TIMING), "starts must be finite times"),
         (lambda: rsv.psnr(FRAMES, FRAMES, 10**400), "data_range must be a number, got a very large int"),
         (lambda: rsv.comparison_figure(FRAMES[0], FRAMES[None]), r"restored must have shape \(C, H, W\) with C = 1"),
         (lambda: rsv.calibrate_row_time(STRIPES, 1000.0, frame_rate=1e-40), "flicker_frequency=1000 Hz is ambiguous"),
-        (
-            lambda: rsv.row_psf(rsv.Vibration(1e6, 50.0), STARTS, TIMING),
-            r"point spread functions of 96 rows, .* GB .* free; check amplitude",
-        ),
+        (lambda: rsv.row_psf(rsv.Vibration(1e6, 50.0), STARTS, TIMING), r"96 rows, .* GB .* check amplitude"),
         (
             lambda: rsv.detect_swept_tone(FRAMES[:1].expand(2, 96, 64), LONG, **BANDS),
             "frames cover 2.01 s; starts of the swept model .* at most .* s: pass larger band_rows",
         ),
-        (
-            lambda: rsv.restore(FRAMES, TIMING, VIBRATION, method="banded", noise_to_signal=1e300),
-            r"noise_to_signal must be at most 1e\+15",
-        ),
+        (lambda: restore(method="banded", noise_to_signal=1e300), r"noise_to_signal must be at most 1e\+15"),
         (lambda: VIBRATION.expanded(10**9), "size must be at most"),
         (lambda: rsv.SensorNoise(5000.0).apply(FRAMES / 0), r"frames must be finite, but pixel \(0, 0, 0\) is inf"),
-        (
-            lambda: rsv.simulate_frames(FRAMES[0] * 1e38, TIMING, VIBRATION, noise=rsv.SensorNoise(5000.0)),
-            r"scene reach .*, at most 1e\+15",
-        ),
+        (lambda: simulate(FRAMES[0] * 1e38, noise=rsv.SensorNoise(5000.0)), r"scene reach .*, at most 1e\+15"),
         (lambda: rsv.StackInfo(torch.zeros(3), "uint8", 255.0), r"shape\[0\] must be a whole number, got 0.0"),
         (lambda: blur().adjoint(FRAMES[0, 0], (96, 64)), r"frames must have shape \(..., R, W\)"),
         (lambda: blur().adjoint(FRAMES[0], (10**6, 10**6)), r"scenes \(1000000, 1000000\) need .* check scene_shape"),
@@ -162,21 +185,23 @@ def test_pixels_beyond_all_scales(value):
         (lambda: rsv.RollingShutterVibration(TIMING, interpolation="nearest"), "interpolation must be .*got 'nearest'"),
         (lambda: rsv.Vibration([1.0, 2.0, 3.0, 4.0, 5.0], 50.0), r"amplitude must have shape \(2,\)"),
         (lambda: rsv.Vibration([[1.0, 2.0], [1.0, 2.0]], [[1.0, 2.0, 3.0]] * 2), "do not fit together"),
-        (lambda: rsv.FreeMotion(torch.zeros(2, 3), 0.0, 1e-3), "N >= 4"),
-        (lambda: rsv.FreeMotion(torch.full((2, 8), torch.nan), 0.0, 1e-3), "finite"),
-        (lambda: rsv.FreeMotion(torch.zeros(2, 8), 0.0, 1e-3, rsv.Vibration.still((3,))), "batch shape"),
+        (lambda: free(torch.zeros(2, 3)), "N >= 4"),
+        (lambda: free(torch.full((2, 8), torch.nan)), "finite"),
+        (lambda: free(torch.zeros(2, 8), rsv.Vibration.still((3,))), "batch shape"),
         (lambda: rsv.FreeMotion.through([0.0, 1.0, 2.0, 4.0], torch.zeros(4, 2)), "evenly spaced"),
         (lambda: rsv.FreeMotion.from_samples([0.0, 1.0, 1.0, 4.0], torch.zeros(4, 2)), "strictly increasing"),
         (lambda: rsv.Camera(500.0, distortion=(0.1, 0.2)), "distortion must be 5 numbers"),
         (lambda: rsv.Camera(500.0, distortion=(0.1,) * 5, fisheye=True), "distortion must be 4 numbers"),
         (lambda: rsv.register_bands(FRAMES, TIMING, search=60), "frames of 96 x 64 px .* of 32 rows searched over 60"),
         (lambda: rsv.register_bands(FRAMES, TIMING, band_rows=240), "too small for bands of 240 rows"),
-        (lambda: rsv.simulate_frames(STRIPES[0].byte(), TIMING, VIBRATION), "scene must be a floating-point tensor"),
+        (lambda: simulate(STRIPES[0].byte()), "scene must be a floating-point tensor"),
+        (lambda: simulate(torch.zeros(600, 99), frame_size=(400, 50)), "frame_rows=104 is"),
+        (lambda: simulate(STRIPES[0], rsv.Vibration.still((2,))), "vibration is a batch of shape"),
         (
-            lambda: rsv.simulate_frames(torch.zeros(600, 99), TIMING, VIBRATION, frame_size=(400, 50)),
-            "frame_rows=104 is",
+            lambda: simulate(FRAMES[0], rsv.Vibration([3.5, 5.5], 50.0), frame_size=(96, 64)),
+            r"scene of \(96, 64\) .* is too small: a frame of \(96, 64\) .* \(140, 104\)",
         ),
-        (lambda: rsv.simulate_frames(STRIPES[0], TIMING, rsv.Vibration.still((2,))), "vibration is a batch of shape"),
+        (lambda: simulate(FRAMES[0], rsv.Vibration(40.0, 50.0)), "is too small"),
         (lambda: bound(frame_size=(400, 40)), "too small"),
         (lambda: bound(torch.zeros(128, 96, dtype=torch.uint8)), "floating-point"),
         (lambda: sharpened({"mtf": ([0.0, 0.1, 0.2], [0.0, 0.0, 0.0])}), "optics transmit 0 at 0.1 cycles per px"),
@@ -210,16 +235,74 @@ def test_pixels_beyond_all_scales(value):
         (lambda: detect(WIDE, principal_point=(1.0, 2.0)), "principal_point=.* requires focal_length"),
         (lambda: detect(WIDE, distortion=(0.1, 0.0, 0.0, 0.0, 0.0)), "distortion=.* requires focal_length"),
         (lambda: detect(WIDE, focal_length=300.0, distortion=(-3.0, 0.0, 0.0, 0.0, 0.0)), "not invertible in frames"),
-        (
-            lambda: rsv.calibrate_row_time_by_motion(FRAMES, frame_rate=90.0, row_time=(6e-5, 5e-5)),
-            "the first must be smaller",
-        ),
-        (lambda: rsv.calibrate_row_time_by_motion(FRAMES, frame_rate=90.0, row_time=(20.0, 60.0)), "in seconds"),
+        (lambda: by_motion(row_time=(6e-5, 5e-5)), "the first must be smaller"),
+        (lambda: by_motion(row_time=(20.0, 60.0)), "in seconds"),
         (lambda: rsv.restore(FRAMES, TIMING, SimpleNamespace(motion=None)), "of other results, pass .motion"),
-        (lambda: rsv.restore(FRAMES, TIMING, VIBRATION, ignore=FRAMES[..., 1:] > 0), "ignore must be a boolean mask"),
-        (lambda: rsv.restore(FRAMES, TIMING, VIBRATION, ignore=FRAMES >= 0), "no pixel with data"),
+        (lambda: restore(ignore=FRAMES[..., 1:] > 0), "ignore must be a boolean mask"),
+        (lambda: restore(ignore=FRAMES >= 0), "no pixel with data"),
+        (lambda: rsv.register_bands(FRAMES * torch.nan, TIMING), r"pixel \(0, 0, 0\) is nan"),
+        (lambda: restore(ignore=FRAMES[:, :5, :5] > 0), r"ignore \(2, 5, 5\) does not fit .* \(2, 96, 64\)"),
+        (lambda: restore(ignore=FRAMES), "ignore must be a bool tensor, got torch.float32"),
+        (lambda: restore(saturation=1e-9), "every pixel is saturated"),
+        (lambda: rsv.detect_motion(FRAMES[:1], TIMING), "at least 2 frames"),
+        (lambda: rsv.detect_swept_tone(FRAMES[:1], TIMING), "at least 2 frames"),
         (lambda: rsv.restore(FRAMES, TIMING, rsv.Vibration.still((3,))), r"vibration of batch shape \(3,\) does"),
         (lambda: rsv.restore(FRAMES, TIMING, rsv.Vibration(1.0, 5e7)), "periods while a row is exposed"),
+        (lambda: restore(half_row=2), "unknown option 'half_row'; the options are .*regularisation"),
+        (lambda: restore(method="dewarp", half_rows=2), "half_rows is no option of method='dewarp'; its options"),
+        (lambda: rsv.VibrationRestorer(TIMING, method="banded", iterations=3), "iterations is no option of method="),
+        (lambda: restore(noise=-1.0), r"noise must be at least 0, got -1.0 \(float\)"),
+        (lambda: restore(method="richardson-lucy", iterations=10**9), "iterations must be at most 1000, got"),
+        (lambda: restore(interpolation="linea"), "interpolation must be 'linear' or 'cubic', got 'linea'"),
+        (lambda: sharpened({"sigma": "wide"}), "optics.sigma must be a number, got 'wide'"),
+        (lambda: sharpened({"width": 1.0}), "unknown option 'optics.width'; the options are sigma, cutoff"),
+        (lambda: rsv.restore(FRAMES[:, 1:], TIMING, VIBRATION, mosaic="RGGB"), "2 x 2 px, but frames have 95 x 64"),
+        (lambda: rsv.restore(RGB, TIMING, VIBRATION, mosaic="RGGB"), "but frames have 3 channels"),
+        (lambda: augment(amplitude=(2.0, 1.0)), "amplitude must not have low above high"),
+        (lambda: augment(frequency="fast"), r"frequency must be a number, \(low, high\)"),
+        (lambda: augment(exposure_rows=(20, 400)), "exposure_rows must be at most 104"),
+        (lambda: augment(roll=((0.0, 1.0), (0.0, 1.0))), "roll must be a number or"),
+        (lambda: rsv.RollingShutterVibration(2e-5), "timing must be a SensorTiming"),
+        (augment, "no vibration has been drawn yet"),
+        (lambda: augment(torch.zeros(1, 1, 400, 8)), "less than the 400 rows"),
+        (lambda: augment(torch.rand(2, 48, 64, 3)), r"have their channels last: pass images.movedim\(-1, -3\)"),
+        (lambda: augment(torch.rand(48, 64, 3)), r"have their channels last: pass images.movedim\(-1, -3\)"),
+        (lambda: dewarp(vibration=VIBRATION.expanded(2)), "vibration is a batch"),
+        (lambda: dewarp(vibration=ROLL), "roll, zoom or a camera"),
+        (lambda: dewarp(size=(500, 90)), "500"),
+        (lambda: dewarp(vibration=rsv.Vibration(500.0, 50.0)), "more than its size"),
+        (lambda: dewarp()(FRAMES[:1]), r"frames must be stacks of .* = \(2, 96, 64\)"),
+        (lambda: dewarp()(FRAMES.double()), r"frames must be torch\.float32"),
+        (lambda: flicker(torch.ones(1, 64, 64)), "100% of the pixels are saturated"),
+        (lambda: flicker(torch.full((2, 128, 64), 0.5)), "no flicker found"),
+        (lambda: flicker(torch.rand(1, 16, 64)), "16 rows along the scan"),
+        (lambda: flicker(FRAMES[:1], on_fraction=0.5, light_contrast=0.5), "not both"),
+        (lambda: flicker(FRAMES[:1], 30.0, frame_rate=29.97), "slower than a frame"),
+        (lambda: flicker(torch.full((1, 64, 64), 900, dtype=torch.int16)), "full_scale"),
+        (lambda: rsv.VideoBorder("zoom"), "border must be 'mirror'"),
+        (lambda: rsv.VideoBorder("crop"), "margins go with border='crop' and only with it"),
+        (lambda: rsv.Margins(4, 4, 0, 0).cut(torch.zeros(8, 8)), "leave nothing of frames of 8 x 8 px"),
+        (lambda: Reason("unknown"), "code must be one of"),
+        (lambda: Reason("tone_blind", value=0.05, limit=0.1), "do not fit its text"),
+        (lambda: Reason("tone_averaged_out", value="much", limit=0.1), "do not fit its text"),
+        (lambda: detect(RGB[:1]), r"got 1 of 3 channels; store grey.*grey stacks is \(B, T, 1, H, W\)"),
+        (lambda: detect(FRAMES[[0, 1, 1, 0]]), "frames 1 and 2 are identical: one of them is a copy"),
+        (
+            lambda: rsv.Camera(390.0, distortion=(-1.0, 0, 0, 0), fisheye=True).check_size(800, 600),
+            r"order \(k1, k2, k3",
+        ),
+        (lambda: detect(WIDE, columns=64), "at least 64 x 96 are needed; reduce search, or use more columns$"),
+        (lambda: dewarped(2, 48, 64, 1), r"or frames.permute\(0, 3, 1, 2\), or channels=\"first\" if"),
+        (lambda: dewarped(48, 64, 3, channels="last"), r"one image \(H, W, C\): pass frames\[None\] with"),
+        (lambda: dewarped(48, 64, 1), r"or channels=\"first\" if these are 48 frames of 64 x 1 px"),
+        (lambda: dewarped(2, 3, 48, 64, channels="last"), r"before the image axes: omit channels=\"last\""),
+        (lambda: dewarped(8, 2, 48, 64), r"appear to be a batch \(B, T, H, W\): pass frames\[:, :, None\]"),
+        (lambda: dewarped(5, 7), r"got \(5, 7\); one grey image is frames\[None\]"),
+        (lambda: detect([FRAMES[0], FRAMES[1, 1:]]), r"frames\[1\] is \(95, 64\) float32 on cpu and frames\[0\]"),
+        (lambda: detect([FRAMES[0], FRAMES[1].byte()]), r"frames\[1\] is \(96, 64\) uint8 on cpu and"),
+        (lambda: detect([FRAMES[0], "b.png"]), r"frames\[1\] must be a tensor or array of numbers, got str; read"),
+        (lambda: detect([]), r"frames must have shape .* got \(0,\)"),
+        (lambda: detect(frame for frame in FRAMES), "got generator; pass a list"),
         (lambda: judge(FRAMES[:1]), "at least 2 frames are needed, got 1"),
         (lambda: judge(FRAMES[:, :16]), r"restored must have the shape \(2, 16, 64\)"),
         (lambda: judge(FRAMES[None, :, None]), "frames must be one stack"),

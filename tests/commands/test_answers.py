@@ -1,40 +1,41 @@
 """Every command ends with its answer, as text, as JSON or not at all; help, completion, progress, existing results."""
 
 import inspect
+import itertools
 import json
 import os
 import re
 import shlex
 import subprocess
 import sys
+import time
+from dataclasses import replace
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 import torch
 import typer
 from program import refused, rsvib
-from small_stack import CAMERA
-from truth import draw_scene
+from truth import Motion, recorded
 
 import rsvib_torch as rsv
-from rsvib_torch.commands import main
-from rsvib_torch.execution.progress import listening
+from rsvib_torch.commands import main, terminal
+from rsvib_torch.execution.progress import listening, steps
 
 PROGRAM = Path(sys.executable).with_name("rsvib")
 TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=200)
-CONFIG = "[sensor]\nrow_time = 1e-4\nexposure_rows = 6\nframe_rows = 200\nfull_scale = 4095\n"
+CONFIG = """
+[sensor]
+row_time = 1e-4
+exposure_rows = 6
+frame_rows = 200
+full_scale = 4095
+
+[simulation]
+frame_size = [96, 64]
+vibration = {amplitude = [1.0, 2.0], frequency = [130.0, 90.0]}
+"""
 COMMANDS = ("run", "detect", "restore", "report", "motion", "known", "calibrate", "simulate")
-
-
-def take(vibration, num_frames, seed=3):
-    scene = torch.from_numpy(draw_scene(192 + 80, 128 + 80, seed)).float()
-    noise = rsv.SensorNoise(read_noise=0.003)
-    generator = torch.Generator().manual_seed(seed)
-    return rsv.simulate_frames(
-        scene, TIMING, vibration, num_frames, frame_size=(192, 128), noise=noise, generator=generator
-    )
 
 
 @pytest.fixture(scope="module", name="place")
@@ -42,19 +43,17 @@ def make_place(tmp_path_factory):
     """Frames of a vibration, of one whose tone along y is blind, of a longer stack, and of a flickering light."""
     folder = tmp_path_factory.mktemp("answers")
     (folder / "camera.toml").write_text(CONFIG)
-    steady = rsv.Vibration([1.6, 1.1], [71.0, 113.0], [0.6, -1.2])
-    blind = rsv.Vibration([1.6, 1.1], [71.0, 49.5], [0.6, -1.2])
-    still = rsv.Vibration.still()
-    for name, vibration, count in (
-        ("frames", steady, 2),
-        ("blind", blind, 2),
-        ("long", steady, 7),
-        ("still", still, 2),
-    ):
-        rsv.write_stack(folder / f"{name}.tif", take(vibration, count), dtype="uint16", full_scale=4095)
+    steady = Motion((1.6, 1.1), (71.0, 113.0), (0.6, -1.2))
+    blind, still = replace(steady, frequency=(71.0, 49.5)), steady.scaled(0.0)
+    for name, motion, count in (("frames", steady, 2), ("blind", blind, 2), ("long", steady, 7), ("still", still, 2)):
+        frames = recorded((192, 128), TIMING, motion, count, 0.003, seed=3).clamp(0, 1)
+        rsv.write_stack(folder / f"{name}.tif", frames, dtype="uint16", full_scale=4095)
     light = 0.4 + 0.2 * torch.cos(2 * torch.pi * torch.arange(512) / 64)
     rsv.write_stack(folder / "led.png", light[None, :, None].expand(1, 512, 16), dtype="uint16", full_scale=65535)
     rsv.write_stack(folder / "scene.png", torch.rand(1, 300, 300), dtype="uint16", full_scale=65535)
+    long = (folder / "long.tif", "--config", folder / "camera.toml", "--quiet")
+    assert rsvib("detect", *long, "--out", folder / "found") == 0
+    assert rsvib("motion", *long, "--out", folder / "m.csv") == 0
     return folder
 
 
@@ -87,7 +86,7 @@ def test_the_answer_of_run_names_everything(place, config, tmp_path, capsys, mon
     assert re.match(r"x     1\.(59|60)\d* ± 0\.0\d+( \(± 0\.\d+\))?  +7[01]\.", vibration[1])
     assumed = " ".join(" ".join(line for line in vibration if not re.match("[xy]:", line)).split())
     assert "assumed: frame_rows, readout direction, scan axis and order of the frames: two frames cannot" in assumed
-    assert "assumed: frame_rows=200: if it is stated 1 % too large, this changes x 71." in assumed
+    assert "assumed: frame_rows=200: if it is stated 1 % too large, this changes x 7" in assumed
     assert answer["Restoration"][0] == "2 frames restored along x and y"
     assert re.fullmatch(r"restored frames agree; estimated improvement \+\d+\.\d dB", answer["Restoration"][1])
     names = " ".join(answer["Files (open before_after.png first)"]).removeprefix("out: ").replace(",", "").split()
@@ -111,78 +110,55 @@ def test_an_axis_that_is_left_unchanged_is_named_with_the_reason(place, config, 
     assert "follow the remedies that the reasons above name" in answer["Next"]
 
 
-@pytest.mark.parametrize(
-    ("command", "keys"),
-    [
-        (("run", "frames.tif", "{}/o"), {"detection", "restoration"}),
-        (("detect", "long.tif", "--out", "{}/o", "--window", "3"), {"windows"}),
-        (("report", "frames.tif", "{}/o"), {"detection", "restoration"}),
-        (("motion", "long.tif", "--out", "{}/o.csv"), {"motion", "columns"}),
-        (("calibrate", "led.png", "--frequency", "1000", "--out", "{}/o.toml"), {"calibration"}),
-    ],
-)
-def test_json_is_the_only_output(place, tmp_path, capsys, monkeypatch, command, keys):
+WORK = {  # arguments of a command, results that it does not replace, and keys of its answer
+    "run": ("frames.tif {}", "manifest.json restored.tif tones.csv", "detection restoration"),
+    "detect": ("long.tif --out {} --window 3", "manifest.json windows.json", "windows"),
+    "report": ("frames.tif {}", "report.html", "detection restoration"),
+    "motion": ("long.tif --out {}/m.csv", "m.csv", "motion columns"),
+    "calibrate": ("led.png --frequency 1000 --out {}/c.toml", "c.toml", "calibration"),
+    "simulate": ("scene.png {}/s.tif", "s.tif", "shape dtype vibration"),
+    "restore": ("long.tif {}/r.tif --vibration found/vibration.json", "r.tif", "detection restoration"),
+    "known": ("long.tif {}/r.tif --motion m.csv --unit px --offset 0", "r.tif", "alignment check restoration"),
+}
+
+
+@pytest.fixture(name="command", params=WORK)
+def make_command(request, place, tmp_path, monkeypatch):
+    """Arguments of a command, its results, and the keys of its answer."""
     monkeypatch.chdir(place)
-    more = () if command[0] == "calibrate" else ("--config", "camera.toml")
-    assert rsvib(*(part.format(tmp_path) for part in command), *more, "--json") == 0
+    arguments, results, keys = WORK[request.param]
+    config = () if request.param == "calibrate" else ("--config", "camera.toml")
+    return (request.param, *arguments.format(tmp_path).split(), *config), results.split(), set(keys.split())
+
+
+def test_json_is_the_only_output(command, capsys):
+    arguments, _, keys = command
+    assert rsvib(*arguments, "--json") == 0
     shown = capsys.readouterr()
     assert shown.err == ""
     answer = json.loads(shown.out)
     assert answer.keys() == keys | {"command", "files", "open_first", "next_steps", "notes", "warnings"}
-    assert answer["command"] == command[0]
+    assert answer["command"] == arguments[0]
     assert answer["open_first"] == answer["files"][0]
     assert all(Path(file).exists() for file in answer["files"])
     assert answer["warnings"] == []
     assert len(shown.out) < 20_000
-    if "detection" in keys:
+    if arguments[0] in ("run", "report"):
         assert len(answer["detection"]["assumptions"]) >= 3
         assert answer["detection"]["sensitivity"].keys() >= {"amplitude_by_frame_rows", "frequency_by_row_time"}
         assert answer["detection"]["reliable"] == [True, True]
         assert answer["detection"]["vibration"]["amplitude"][0][0] == pytest.approx(1.6, rel=0.01)
     if "restoration" in keys:
         assert (answer["restoration"]["axes"], answer["restoration"]["outcome"]) == (["x", "y"], "helps")
+    if "check" in keys:
+        assert answer["check"]["helps"] is True
+    if "shape" in keys:
+        assert answer["vibration"]["amplitude"] == [[1.0], [2.0]]
+        assert answer["shape"] == list(rsv.read_stack(answer["files"][0]).shape)
 
 
-def test_json_of_restore_known_and_simulate(place, config, tmp_path, capsys):
-    frames = place / "long.tif"
-    assert rsvib("detect", frames, *config, "--out", tmp_path / "d", "--quiet") == 0
-    assert rsvib("motion", frames, *config, "--out", tmp_path / "m.csv", "-q") == 0
-    assert capsys.readouterr().out == ""
-    vibration = ("--vibration", tmp_path / "d" / "vibration.json")
-    assert rsvib("restore", frames, tmp_path / "r.tif", *config, *vibration, "--json") == 0
-    assert json.loads(capsys.readouterr().out)["restoration"]["outcome"] == "helps"
-    recording = ("--motion", tmp_path / "m.csv", "--unit", "px", "--offset", 0)
-    assert rsvib("known", frames, tmp_path / "k.tif", *config, *recording, "--json") == 0
-    answer = json.loads(capsys.readouterr().out)
-    assert answer["check"]["helps"] is True
-    assert answer["restoration"]["predicted_gain_db"] > 10
-    vibration = "[simulation.vibration]\namplitude = [1.0, 2.0]\nfrequency = [130.0, 90.0]\n"
-    (tmp_path / "c.toml").write_text(CAMERA + "[simulation]\nframe_size = [96, 64]\n" + vibration)
-    assert rsvib("simulate", place / "scene.png", tmp_path / "s.tif", "--config", tmp_path / "c.toml", "--json") == 0
-    answer = json.loads(capsys.readouterr().out)
-    assert answer["vibration"]["amplitude"] == [[1.0], [2.0]]
-    assert answer["shape"] == list(rsv.read_stack(tmp_path / "s.tif").shape)
-
-
-EXISTING = {
-    "run": (("run", "frames.tif", "{}"), ["manifest.json", "restored.tif", "tones.csv"]),
-    "detect": (("detect", "frames.tif", "--out", "{}"), ["vibration.json", "windows.json"]),
-    "report": (("report", "frames.tif", "{}"), ["report.html"]),
-    "motion": (("motion", "long.tif", "--out", "{}/m.csv"), ["m.csv"]),
-    "calibrate": (("calibrate", "led.png", "--frequency", "1000", "--out", "{}/c.toml"), ["c.toml"]),
-    "simulate": (("simulate", "scene.png", "{}/s.tif"), ["s.tif"]),
-    "restore": (("restore", "frames.tif", "{}/r.tif", "--vibration", "v.json"), ["r.tif"]),
-    "known": (("known", "frames.tif", "{}/r.tif", "--motion", "m.csv", "--unit", "px"), ["r.tif"]),
-}
-
-
-@pytest.mark.parametrize("name", EXISTING)
-def test_existing_results_are_not_replaced(place, tmp_path, capsys, monkeypatch, name):
-    monkeypatch.chdir(place)
-    (place / "m.csv").write_text("time,x,y\n" + "".join(f"{0.001 * i},0,0\n" for i in range(50)))
-    command, results = EXISTING[name]
-    arguments = [part.format(tmp_path) for part in command]
-    arguments += [] if name == "calibrate" else ["--config", "camera.toml"]
+def test_existing_results_are_not_replaced(command, tmp_path, capsys):
+    arguments, results, _ = command
     for result in results:
         (tmp_path / result).write_text("precious")
         error = refused(capsys, *arguments)
@@ -243,53 +219,30 @@ def test_shell_completion():
     assert done.stdout.split() == ["restore", "report"]
 
 
-LOOPS = """
-import time
-from rsvib_torch.commands.terminal import current_output, working
-from rsvib_torch.execution.progress import listening, steps
-
-with working("restoring"):
-    advance = steps(4, "frames")
-    for _ in range(3):
-        time.sleep(0.15)
-        advance()
-    time.sleep(0.3)
-with working("restoring frames.tif", counts=True) as progress:
-    progress(10, 100)  # frames of the interrupted run
-    time.sleep(0.3)
-    progress(20, 100)
-    time.sleep(0.3)
-current_output().quiet = True
-with working("reading quietly"):
-    steps(2, "frames")()
-    time.sleep(0.3)
-"""
-
-
-def test_progress_in_a_log_is_a_line_after_twice_the_time():
-    code = LOOPS.replace(
-        "with working", "from rsvib_torch.commands import terminal\nterminal.LOG_AFTER = 0.1\nwith working", 1
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    lines = done.stderr.splitlines()
-    assert done.stdout == ""
-    assert any(re.fullmatch(r"rsvib: progress: restoring: \d of 4 frames.*", line) for line in lines)
-    assert any(
-        re.fullmatch(r"rsvib: progress: restoring frames.tif: 20 of 100 frames  \S+/s  \S+ left", line)
-        for line in lines
-    )
+def test_progress_in_a_log_is_a_line_after_twice_the_time(monkeypatch, capsys):
+    monkeypatch.setattr(terminal, "LOG_AFTER", 0.1)
+    with terminal.working("restoring"):
+        advance = steps(4, "frames")
+        for _ in range(3):
+            time.sleep(0.15)
+            advance()
+        time.sleep(0.3)
+    with terminal.working("restoring frames.tif", counts=True) as progress:
+        for done in (10, 20):  # the first 10 are frames of the interrupted run
+            progress(done, 100)
+            time.sleep(0.3)
+    monkeypatch.setattr(terminal.current_output(), "quiet", True)
+    with terminal.working("reading quietly"):
+        steps(2, "frames")()
+        time.sleep(0.3)
+    shown = capsys.readouterr()
+    lines = shown.err.splitlines()
+    assert shown.out == ""
+    begin, counted = "rsvib: progress: ", r"restoring frames.tif: 20 of 100 frames  \S+/s  \S+ left"
+    assert any(re.fullmatch(begin + r"restoring: \d of 4 frames.*", line) for line in lines)
+    assert any(re.fullmatch(begin + counted, line) for line in lines)
     assert 3 <= len(lines) <= 8
-    assert "quietly" not in done.stderr
-
-
-def test_missing_frames_are_named(place, tmp_path, capsys):
-    folder = tmp_path / "numbered"
-    folder.mkdir()
-    for number, frame in enumerate(rsv.read_stack(place / "long.tif").numpy()):
-        if number != 3:
-            cv2.imwrite(str(folder / f"frame_{number}.png"), (255 * frame).round().astype(np.uint8))
-    assert rsvib("detect", folder, "--config", place / "camera.toml", "--out", tmp_path / "o", "--json") == 0
-    assert any("1 frame is missing" in note for note in json.loads(capsys.readouterr().out)["notes"])
+    assert "quietly" not in shown.err
 
 
 def test_long_operations_report_their_progress(place, tmp_path):
@@ -320,9 +273,10 @@ def test_long_operations_report_their_progress(place, tmp_path):
 
 
 def test_warnings_are_in_the_json_and_printed_quietly(place, config, tmp_path, capsys):
-    warning = "no vibration was found that can be removed: the frames are written unchanged"
-    for number, option in enumerate(("--json", "-q")):
-        assert rsvib("run", place / "still.tif", tmp_path / f"{number}", *config, option) == 0
+    commands = {"run": "the frames are written unchanged", "report": "the page has the input frames only"}
+    for (command, kept), option in itertools.product(commands.items(), ("--json", "-q")):
+        warning = f"no vibration was found that can be removed: {kept}"
+        assert rsvib(command, place / "still.tif", tmp_path / f"{command}{option}", *config, option) == 0
         shown = capsys.readouterr()
         assert shown.err == f"rsvib: warning: {warning}\n"
         assert shown.out == "" if option == "-q" else json.loads(shown.out)["warnings"] == [warning]

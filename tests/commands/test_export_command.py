@@ -25,15 +25,11 @@ def place(tmp_path_factory):
     return folder, detected, tuple(frames.shape[-2:])
 
 
-def run(*arguments):
-    return rsvib("export", *arguments)
-
-
 def test_gcsv_with_a_focal_length(place, tmp_path, capsys):
     folder, detected, _ = place
     out = tmp_path / "clip.gcsv"
     frames = ("--frames", folder / "frames.tif")
-    assert run(folder / "vibration.json", out, *frames, "--focal-length", 900, "--json") == 0
+    assert rsvib("export", folder / "vibration.json", out, *frames, "--focal-length", 900, "--json") == 0
     answer = json.loads(capsys.readouterr().out)
     assert (answer["format"], answer["num_frames"]) == ("gcsv", 2)
     first = out.read_text().split("t,gx,gy,gz\n")[1].splitlines()[0]
@@ -55,10 +51,10 @@ def test_axes_that_are_not_reliable_are_left_out(place, tmp_path, capsys):
         return np.loadtxt(out.read_text().split("t,gx,gy,gz\n")[1].splitlines(), delimiter=",")[:, 1]
 
     path.write_text(json.dumps(data | {"reliable": [True, False], "findings": [[], [blind]]}))
-    assert run(path, tmp_path / "rates.gcsv", *options) == 0
+    assert rsvib("export", path, tmp_path / "rates.gcsv", *options) == 0
     assert "y is not exported: its vibration is not reliable (blind)" in " ".join(capsys.readouterr().err.split())
     assert np.abs(pitch(tmp_path / "rates.gcsv")).max() == 0
-    assert run(path, tmp_path / "forced.gcsv", *options, "--force") == 0
+    assert rsvib("export", path, tmp_path / "forced.gcsv", *options, "--force") == 0
     assert np.abs(pitch(tmp_path / "forced.gcsv")).max() > 0
     path.write_text(json.dumps(data | {"reliable": [False, False], "findings": [[blind], [blind]]}))
     assert "--overwrite" in refused(capsys, "export", path, tmp_path / "rates.gcsv", *options, "--force")

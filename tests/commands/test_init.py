@@ -9,7 +9,7 @@ from program import Terminal, refused, rsvib
 from small_video import write_video
 
 from rsvib_torch.config import presets, read_config
-from rsvib_torch.io import StackInfo, read_stack, write_stack
+from rsvib_torch.io import StackInfo, write_stack
 
 TIMES = ("--row-time", "40us", "--exposure", "1/1250")
 RATE = ("--frame-rate", "30000/1001")
@@ -30,12 +30,11 @@ def go_to_folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def write_clip(path, angle=0):
-    """Five frames whose first rows are bright, at 25 per second, to be turned by an angle."""
-    frames = np.broadcast_to(20 * np.arange(5, dtype=np.uint8)[:, None, None, None], (5, 64, 48, 3)).copy()
-    frames[:, :8] = 250
+def write_clip(path):
+    """Five frames, at 25 per second."""
+    frames = np.broadcast_to(20 * np.arange(5, dtype=np.uint8)[:, None, None, None], (5, 64, 48, 3))
     options = {"layout": "rgb24", "codec": "libx264", "encoded": "yuv420p", "rate": 25}
-    write_video(path, frames, np.arange(5) / 25, rotation=angle, **options)
+    write_video(path, frames, np.arange(5) / 25, **options)
 
 
 def test_values_of_a_video_and_of_options(place, capsys):
@@ -54,17 +53,6 @@ def test_values_of_a_video_and_of_options(place, capsys):
     timing = read_config(place / "camera.toml").timing
     assert (timing.exposure_rows, timing.frame_rate) == pytest.approx((20, 25))
     assert "rsvib run clip.mp4 results --config camera.toml --video" in capsys.readouterr().out
-
-
-def test_rotated_video(place):
-    """Frames are read as stored: the rows that the sensor reads first are the first rows at any rotation."""
-    write_clip(place / "clip.mp4", 90)
-    assert init("clip.mp4", *TIMES) == 0
-    sensor = tomllib.loads((place / "camera.toml").read_text())["sensor"]
-    assert (sensor["scan_axis"], sensor["readout_direction"]) == ("y", "forward")
-    first = read_stack(place / "clip.mp4")[0, 0]
-    assert first[:7].min() > 0.8
-    assert first[9:].max() < 0.2
     assert init("clip.mp4", *TIMES, "--scan-axis", "x", "--overwrite") == 0  # options are preferred
     assert tomllib.loads((place / "camera.toml").read_text())["sensor"]["scan_axis"] == "x"
 

@@ -10,6 +10,7 @@ from refusals import refuses
 import rsvib_torch as rsv
 from rsvib_torch.datasets import city_and_fields
 from rsvib_torch.execution.progress import listening
+from rsvib_torch.registration.methods import BAND_METHODS
 
 SIZE = 192
 TIMING = rsv.SensorTiming(row_time=1 / (24 * 1.15 * SIZE), exposure_rows=2, frame_rows=1.15 * SIZE)
@@ -105,26 +106,24 @@ def test_frames_that_do_not_determine_a_motion(function, name):
     assert not reliable.any()
 
 
-@pytest.mark.parametrize("function", [rsv.detect_motion, rsv.detect_swept_tone])
-def test_one_frame_is_refused(function):
-    with pytest.raises(ValueError, match="at least 2 frames"):
-        function(torch.rand(1, SMALL, SMALL), SMALL_TIMING)
-
-
-def test_independent_noise_at_a_low_frame_rate_has_no_vibration():
-    """Few rows agree by chance, and slow tones of many pixels explain them; without the verdict they are reliable."""
-    noise = 0.5 + 0.1 * torch.randn(4, 256, 256, generator=torch.Generator().manual_seed(0))
-    found = rsv.detect_vibration(noise, rsv.SensorTiming(50e-6, 10, 1600))
+@pytest.mark.parametrize(
+    ("function", "options", "frame_rows", "draw", "shape", "seed"),
+    [
+        (rsv.detect_vibration, {}, 1600, torch.randn, (4, 256, 256), 0),  # slow tones of many pixels explain some rows
+        (rsv.detect_motion, {}, 160, torch.rand, (4, 128, 128), 4),  # so does a spline, and leaves no residual
+        (rsv.detect_motion, {}, 288, torch.rand, (4, 256, 256), 3),
+        *(
+            (rsv.detect_vibration, {"method": "bands", "registration": name}, 2048, torch.randn, (2, 1024, 256), 1)
+            for name in BAND_METHODS
+        ),
+    ],
+)
+def test_independent_noise_has_no_motion(function, options, frame_rows, draw, shape, seed):
+    """Some rows agree by chance."""
+    noise = 0.5 + 0.1 * draw(shape, generator=torch.Generator().manual_seed(seed))
+    found = function(noise, rsv.SensorTiming(50e-6, 10, frame_rows), **options)
     assert not found.reliable.any()
     assert all("rows_not_registered" in [reason.code for reason in against] for against in found.findings)
-
-
-def test_too_few_columns_name_the_remedy_that_helps():
-    frames = torch.rand(2, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
-    refuses(
-        lambda: rsv.detect_vibration(frames, TIMING, columns=64),
-        r"at least 64 x 96 are needed; reduce search, or use more columns$",
-    )
 
 
 def test_an_acceleration_that_is_no_free_motion_names_the_remedy():

@@ -43,6 +43,10 @@ def test_paper_pair(pairs, paper_camera, registration):
     assert result.vibration.amplitude.shape == (2, 1)
     assert result.reliable.tolist() == [True, True]
     assert result.findings == ((), ())
+    for name in ("amplitude", "frequency"):  # standard deviations allow for a further tone, errors are smaller
+        value, std = (getattr(part, name)[:, 0].numpy() for part in (result.vibration, result.std))
+        assert (np.abs(value - getattr(motion, name)) < 4 * std).all()
+        assert (std < 0.1 * value).all()
     # 50 Hz has the gain +0.62, 30 Hz the gain -1.46: amplitudes stay positive, the sign is in the phase
     assert result.gain[:, 0].tolist() == pytest.approx([0.626, -1.461], abs=0.03)
     assert bool((result.vibration.amplitude > 0).all())
@@ -64,13 +68,6 @@ def test_no_tone_is_detected_without_vibration(paper_camera):
     assert result.vibration.image_motion.tolist() == pytest.approx(image_motion, abs=2.0)
 
 
-@pytest.mark.parametrize("registration", METHODS)
-def test_frames_of_noise_are_not_reliable(paper_camera, registration):
-    frames = torch.randn(2, 1024, 256, generator=torch.Generator().manual_seed(1))
-    result = detect_bands(frames, paper_camera, registration=registration)
-    assert not bool(result.reliable.any())
-
-
 def test_number_of_tones_can_be_set(pairs, paper_camera):
     frames, motion = pairs[0]
     result = detect_bands(frames, paper_camera, tones=2)
@@ -89,23 +86,6 @@ def test_frames_with_little_overlap_do_not_affect_the_other_stacks_of_a_batch():
     assert together.reliable.tolist() == [[False, False], [True, True]]
     amplitude = together[1].vibration.amplitude[:, :1]  # the other stack may have more tones
     torch.testing.assert_close(amplitude, alone.vibration.amplitude, rtol=0, atol=0.02)  # px
-
-
-def test_standard_deviations_from_frames_agree_with_errors(paper_camera):
-    """Errors divided by their standard deviations are of order one for all noise seeds, scenes and phases.
-
-    The standard deviations allow for a further tone, so that errors are smaller for one tone.
-    """
-    ratios = []
-    for seed in range(20, 24):
-        motion = Motion(phase=random_phase(seed))
-        result = detect_bands(recorded((2048, 256), paper_camera, motion, 2, NOISE, seed=seed), paper_camera)
-        found, std = result.vibration, result.std
-        for name in ("amplitude", "frequency"):
-            error = getattr(found, name)[:, 0].numpy() - np.array(getattr(motion, name))
-            ratios.append(error / getattr(std, name)[:, 0].numpy())
-    spread = np.sqrt(np.mean(np.square(ratios)))
-    assert 0.1 < spread < 2
 
 
 def test_columns_with_detail_are_selected(pairs, paper_camera):

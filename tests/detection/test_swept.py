@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from truth import MARGIN, Curve, draw_scene, take_frames
+from truth import Curve, recorded
 
 import rsvib_torch as rsv
 from rsvib_torch.datasets import city_and_fields
@@ -23,15 +23,8 @@ def both_swept(times):
     )
 
 
-@pytest.fixture(scope="module", name="scene")
-def make_scene():
-    return draw_scene(HEIGHT + 2 * MARGIN, WIDTH + 2 * MARGIN, 6)
-
-
-def taken(scene, timing, motion, count, noise=0.004, size=(HEIGHT, WIDTH)):
-    """Frames of a part of the scene."""
-    part = scene[: size[0] + 2 * MARGIN, : size[1] + 2 * MARGIN]
-    return torch.from_numpy(take_frames(part, timing, motion, count, noise)).float()
+def taken(timing, motion, count, noise=0.004, size=(HEIGHT, WIDTH)):
+    return recorded(size, timing, motion, count, noise, seed=6)
 
 
 def agrees(found, times=4, share=0.002, **truths):
@@ -41,17 +34,8 @@ def agrees(found, times=4, share=0.002, **truths):
     return all(bool((errors[name] < allowed[name]).all()) for name in truths)
 
 
-@pytest.fixture(scope="module", name="frames")
-def make_frames(scene):
-    return taken(scene, TIMING, both_swept, FRAMES, 0.005)
-
-
-@pytest.fixture(scope="module", name="found")
-def make_found(frames):
-    return rsv.detect_swept_tone(frames, TIMING)
-
-
-def test_decay_and_chirp_are_measured(found):
+def test_decay_and_chirp_are_measured():
+    found = rsv.detect_swept_tone(taken(TIMING, both_swept, FRAMES, 0.005), TIMING)
     assert found.amplitude.tolist() == pytest.approx(AMPLITUDE, rel=0.02)
     assert found.frequency.tolist() == pytest.approx(FREQUENCY, rel=0.01)
     assert found.decay.tolist() == pytest.approx(DECAY, abs=0.6)
@@ -80,10 +64,10 @@ def tone(amplitude, frequency, decay=0.0, chirp=0.0, phase=0.0):
 NEAR_BLIND = rsv.SensorTiming(row_time=4e-5, exposure_rows=20, frame_rows=220)
 
 
-def test_two_frames_are_refused(scene):
+def test_two_frames_are_refused():
     steady = tone(1.6, 90.0, phase=1.0)
     timing = rsv.SensorTiming(row_time=4e-5, exposure_rows=20, frame_rows=300)  # blind at 83.3 Hz
-    frames = taken(scene, timing, steady, 3, 0.002)
+    frames = taken(timing, steady, 3, 0.002)
     two = rsv.detect_swept_tone(frames[:2], timing)
     assert not two.reliable.any()
     assert all(of_axis[0].code == "too_few_frames_for_sweep" for of_axis in two.findings)
@@ -93,10 +77,10 @@ def test_two_frames_are_refused(scene):
     assert (three.std["frequency"] < 0.5).all()
 
 
-def test_other_minima_are_left(scene):
+def test_other_minima_are_left():
     # from one start, the fit ended at 6.8 ± 0.3 Hz, 11.2 ± 0.6 px with a decay of 112 ± 3 /s
     swept = tone(1.7, 29.3, decay=16.9, chirp=461.0, phase=-0.4)
-    found = rsv.detect_swept_tone(taken(scene, NEAR_BLIND, swept, 4, size=(192, 96)), NEAR_BLIND)
+    found = rsv.detect_swept_tone(taken(NEAR_BLIND, swept, 4, size=(192, 96)), NEAR_BLIND)
     assert found.reliable.all()
     assert agrees(found, times=5, share=0.0, amplitude=1.7, frequency=29.3, decay=16.9, chirp=461.0)
     assert (found.std["frequency"] < 1.5).all()
@@ -112,27 +96,26 @@ def test_aliases_are_tried_and_blind_tones_refused(rate, hertz, codes):
     def decaying(times):
         return np.exp(-times / 1.2)[..., None] * [2.5, 1.36] * np.sin(2 * np.pi * times[..., None] * hertz + 1.0)
 
-    frames = take_frames(draw_scene(208, 208, 1), timing, Curve(decaying), 40, noise=0.003)
-    found = rsv.detect_swept_tone(frames, timing)
+    found = rsv.detect_swept_tone(recorded((128, 128), timing, Curve(decaying), 40, 0.003, seed=1), timing)
     assert [tuple(reason.code for reason in of_axis) for of_axis in found.findings] == codes
     for axis in np.flatnonzero(found.reliable.numpy()):
         assert found.frequency[axis].item() == pytest.approx(hertz[axis], abs=0.01)
 
 
-def test_a_tone_that_sweeps_through_a_blind_frequency_is_known(scene):
+def test_a_tone_that_sweeps_through_a_blind_frequency_is_known():
     """Its frequency is twice the frame rate in the middle of the record, and 1.8 and 2.2 times at the ends."""
     rate, count = NEAR_BLIND.frame_rate, 8
     start, chirp = 1.8 * rate, 0.4 * rate**2 / count
-    frames = taken(scene, NEAR_BLIND, tone(1.3, start, chirp=chirp), count, size=(192, 128))
+    frames = taken(NEAR_BLIND, tone(1.3, start, chirp=chirp), count, size=(192, 128))
     found = rsv.detect_swept_tone(frames, NEAR_BLIND)
     assert found.reliable.all()
     assert agrees(found, amplitude=1.3, frequency=start, chirp=chirp)
 
 
 @pytest.mark.parametrize("contrast", [0.02, 0.3])  # of the scene; without the check 4.20 ± 0.08 px for 0.02
-def test_noise_that_hides_the_scene_is_refused(scene, contrast):
-    flat = 0.5 + contrast * (torch.from_numpy(take_frames(scene, TIMING, tone(0.5, 60.0), 3, 0.0)) - 0.5)
-    noisy = flat.float() + 0.02 * torch.randn(flat.shape, generator=torch.Generator().manual_seed(2))
+def test_noise_that_hides_the_scene_is_refused(contrast):
+    flat = 0.5 + contrast * (taken(TIMING, tone(0.5, 60.0), 3, 0.0) - 0.5)
+    noisy = flat + 0.02 * torch.randn(flat.shape, generator=torch.Generator().manual_seed(2))
     assert not rsv.detect_swept_tone(noisy, TIMING).reliable.any()
     if contrast < 0.1:
         assert not rsv.detect_motion(noisy, TIMING).reliable.any()
@@ -155,18 +138,18 @@ def test_a_tone_that_another_one_explains_as_well_is_refused():
     assert "other_swept_tone" in {reason.code for reason in found.findings[1]}
 
 
-def test_long_record_is_followed_from_the_part_with_the_largest_offsets(scene):
+def test_long_record_is_followed_from_the_part_with_the_largest_offsets():
     # starts are searched in 67 of these 90 frames
     timing = rsv.SensorTiming(row_time=6e-5, exposure_rows=20, frame_rows=110)
     swept = tone(2.5, 83.0, decay=8.0, chirp=20.0, phase=0.4)
-    found = rsv.detect_swept_tone(taken(scene, timing, swept, 90, size=(100, 128)), timing)
+    found = rsv.detect_swept_tone(taken(timing, swept, 90, size=(100, 128)), timing)
     assert found.reliable.all()
     assert agrees(found, amplitude=2.5, frequency=83.0, decay=8.0, chirp=20.0)
 
 
-def test_axis_without_motion_has_no_tone(scene):
+def test_axis_without_motion_has_no_tone():
     along_x = Curve(lambda t: np.stack([2 * np.exp(-10 * t) * np.sin(2 * np.pi * 45 * t), 0 * t], -1))
-    found = rsv.detect_swept_tone(taken(scene, TIMING, along_x, 3, 0.005), TIMING)
+    found = rsv.detect_swept_tone(taken(TIMING, along_x, 3, 0.005), TIMING)
     assert found.amplitude[1] == 0
     assert found.findings[1] == (Reason("no_tone", "y"),)
     assert found.frequency[0].item() == pytest.approx(45.0, rel=0.02)

@@ -61,6 +61,10 @@ def fitted(measurements, frequency):
     return fit_tones(measurements, np.repeat(np.asarray(frequency)[:, None, None], 2, 1), active)
 
 
+def rms(values):
+    return float(values.square().mean().sqrt())
+
+
 def row_starts(num_frames):
     return starts_of(TIMING, num_frames).T.ravel()
 
@@ -113,14 +117,11 @@ def test_bias_by_aliasing_is_removed_and_allowed_for(num_frames):
         error = vibration.amplitude[:, 0, 0] - torch.from_numpy(amplitude)
         return error.unflatten(0, (2, batch)), (error / std.amplitude[:, 0, 0]).unflatten(0, (2, batch))
 
-    def mean_square(values):
-        return values.square().mean(1).sqrt()
-
     (before, _), (after, in_std) = errors(raw), errors(corrected)
-    assert float(mean_square(after)[1] / mean_square(before)[1]) < 0.7
-    assert 0.4 < float(mean_square(in_std)[1]) < 1.3  # the bias increases the variance of the residuals
+    assert rms(after[1]) < 0.7 * rms(before[1])
+    assert 0.4 < rms(in_std[1]) < 1.3  # the bias increases the variance of the residuals
     # a displacement of 0.1 px shows its part of the bias as an amplitude; the prior allows for 3e-3 px
-    assert 0.5 < float(mean_square(in_std)[0]) < 2.5
+    assert 0.5 < rms(in_std[0]) < 2.5
 
 
 @pytest.mark.parametrize(("num_frames", "size", "most"), [(4, 0.02, 0.75), (8, 0.02, 0.55), (8, 0.0, 1.02)])
@@ -135,9 +136,6 @@ def test_aliasing_of_single_rows_is_weakened(num_frames, size, most):
     raw = fitted(measurements, frequency)
     weak = with_weak_aliasing(measurements, raw)
     found = fit_tones(weak, raw, raw.active)
-
-    def rms(values):
-        return float(values.square().mean().sqrt())
 
     errors = [vibration_of_fit(fit)[0].amplitude[:, 0, 0] - 1.7 for fit in (raw, found)]
     assert rms(errors[1]) < most * rms(errors[0])
@@ -163,7 +161,7 @@ def test_errors_that_a_part_of_the_scene_has_in_all_frames_are_contained():
 
     def rms_in_std(fit):
         vibration, std = vibration_of_fit(fit)
-        return float(((vibration.amplitude[:, 0, 0] - 1.0) / std.amplitude[:, 0, 0]).square().mean().sqrt())
+        return rms((vibration.amplitude[:, 0, 0] - 1.0) / std.amplitude[:, 0, 0])
 
     assert rms_in_std(raw) > 1.7
     assert 0.8 < rms_in_std(with_errors_of_blocks(measurements, raw)) < 1.2

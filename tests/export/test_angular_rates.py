@@ -1,9 +1,12 @@
 """Gyroscope logs: their rates, integrated with a parser of their own, are the attitude of the motion."""
 
+from itertools import accumulate
+
 import numpy as np
 import pytest
 import torch
 from refusals import refuses
+from scipy.spatial.transform import Rotation
 
 import rsvib_torch as rsv
 
@@ -29,24 +32,12 @@ def parsed(path):
     return header, table[:, 0] * float(header["tscale"]), table[:, 1:] * float(header["gscale"])
 
 
-def exponential(vector):
-    """Rotation matrix of a vector (Rodrigues)."""
-    angle = np.linalg.norm(vector)
-    x, y, z = vector
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    if angle < 1e-9:
-        return np.eye(3) + cross + 0.5 * cross @ cross
-    return np.eye(3) + np.sin(angle) / angle * cross + (1 - np.cos(angle)) / angle**2 * cross @ cross
-
-
 def largest_error(times, rates, attitude):
     """Largest angle in rad between the integrated rates and the attitude (N, 3) at the same times."""
-    turned, worst = exponential(attitude[0]), 0.0
-    for k in range(1, len(times)):
-        turned = turned @ exponential(0.5 * (rates[k - 1] + rates[k]) * (times[k] - times[k - 1]))
-        wrong = exponential(attitude[k]).T @ turned
-        worst = max(worst, np.linalg.norm([wrong[2, 1], wrong[0, 2], wrong[1, 0]]))
-    return worst
+    true = Rotation.from_rotvec(attitude)
+    steps = Rotation.from_rotvec(0.5 * (rates[1:] + rates[:-1]) * np.diff(times)[:, None])
+    turned = list(accumulate([true[0], *steps], lambda before, step: before * step))
+    return (true.inv() * Rotation.concatenate(turned)).magnitude().max()
 
 
 def tones(times, motion=VIBRATION, focal_length=800.0):

@@ -3,13 +3,11 @@
 import itertools
 import math
 
-import numpy as np
 import pytest
 import torch
-from refusals import refuses
 
 from rsvib_torch import SensorTiming
-from rsvib_torch.frames.prepare import as_float_frames, prepare_frames
+from rsvib_torch.frames.prepare import prepare_frames
 
 ORIENTATIONS = list(itertools.product((-2, -1), ("forward", "reverse")))
 LAYOUTS = [(2, 5, 7), (2, 3, 5, 7), (4, 2, 3, 5, 7)]
@@ -73,38 +71,3 @@ def test_masks_that_broadcast(shape):
     prepared = prepare_frames(torch.rand(2, 3, 4, 6), sensor(), ignore=ignore.numpy())
     expected = ignore if len(shape) == 4 else ignore.expand(2, 4, 6)[:, None].expand(2, 3, 4, 6)
     assert torch.equal(prepared.missing[0], expected)
-
-
-@pytest.mark.parametrize(
-    ("options", "error", "message"),
-    [
-        ({"ignore": torch.zeros(5, 5, dtype=torch.bool)}, ValueError, r"ignore \(5, 5\) does not fit .* \(2, 4, 6\)"),
-        ({"ignore": torch.zeros(4, 6)}, TypeError, "ignore must be a bool tensor, got torch.float32"),
-        ({"frames": torch.full((2, 4, 6), math.nan)}, ValueError, "no pixel with data"),
-        ({"frames": torch.full((2, 4, 6), math.nan), "allow_missing": False}, ValueError, r"pixel \(0, 0, 0\) is nan"),
-        ({"frames": torch.rand(2, 3000, 6)}, ValueError, "frame_rows=2048 is less than the 3000 rows"),
-        ({"saturation": 1e-9}, ValueError, "every pixel is saturated"),
-        ({"timing": "camera"}, TypeError, "timing must be a SensorTiming, got str"),
-    ],
-)
-def test_bad_input(options, error, message):
-    arguments = {"frames": 0.1 + torch.rand(2, 4, 6), "timing": sensor(), **options}
-    refuses(lambda: prepare_frames(arguments.pop("frames"), arguments.pop("timing"), **arguments), message, error)
-
-
-def test_float_frames_are_not_scaled():
-    for dtype in (torch.float32, torch.float64):
-        frames = torch.rand(2, 4, 5, dtype=torch.float64).to(dtype) * 300 - 7
-        assert as_float_frames(frames) is frames
-    for dtype in (torch.float16, torch.bfloat16):
-        frames = (torch.rand(2, 4, 5) * 300 - 7).to(dtype)
-        assert torch.equal(as_float_frames(frames), frames.to(torch.float32))
-
-
-def test_integer_frames_are_scaled():
-    counts = torch.tensor([[[0, 51, 255]]], dtype=torch.uint8)
-    assert as_float_frames(counts).flatten().tolist() == pytest.approx([0.0, 0.2, 1.0])
-    deep = np.array([[[0, 4095, 819]]], dtype=np.uint16)
-    scaled = as_float_frames(deep, 4095)
-    assert scaled.dtype == torch.float32
-    assert scaled.flatten().tolist() == pytest.approx([0.0, 1.0, 0.2])

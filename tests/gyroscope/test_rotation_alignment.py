@@ -11,7 +11,7 @@ import torch
 from gpmf_file import write_rates
 from program import refused, rsvib
 from refusals import refuses
-from rotating_camera import BIAS, COUNT, FOCAL_LENGTH, OFFSET, TIMING, attitude, in_axes, rates_of, recorded, take
+from rotating_camera import BIAS, COUNT, FOCAL_LENGTH, OFFSET, TIMING, attitude, recorded, take, unrelated_rates
 
 import rsvib_torch as rsv
 from rsvib_torch.gyroscope.corner_tracks import CornerTracks, corner_tracks
@@ -81,7 +81,7 @@ def test_other_readout():
 def test_fisheye_lens():
     """A lens that moves the corners by 9 px: without it, pans do not explain the displacements at the border."""
     lens = (-0.6, 0.2, 0.0, 0.0)
-    frames, limits = take(TIMING, fisheye=np.array(lens)), (OFFSET - 0.01, OFFSET + 0.01)
+    frames, limits = take(TIMING, fisheye=lens), (OFFSET - 0.01, OFFSET + 0.01)
     camera = rsv.Camera(FOCAL_LENGTH, distortion=lens, fisheye=True)
     found = rsv.align_motion(frames, TIMING, recorded("yZx"), camera=camera, offsets=limits)
     check(found, "yZx")
@@ -191,10 +191,7 @@ def test_mirrored_axes_are_refused(tracks):
 
 
 def test_recording_of_another_motion_is_refused(tracks):
-    rates = recorded()
-    random = np.random.default_rng(4).standard_normal((len(rates.times), 3))
-    smooth = np.stack([np.convolve(column, np.hanning(25) / 12, "same") for column in random.T], -1)
-    found = aligned(tracks, rsv.AngularRates(rates.times, torch.from_numpy(0.3 * smooth)))
+    found = aligned(tracks, unrelated_rates(recorded().times))
     assert not found.reliable
     assert "recording_incomplete" in {reason.code for reason in found.findings}
 
@@ -269,10 +266,7 @@ def test_translation_of_the_camera_is_no_bias():
     tables = (torch.from_numpy(values) for values in (pair, cell, rows, place, offsets))
     starts = timing.frame_period * torch.arange(pairs + 1, dtype=torch.float64).unfold(0, 2, 1)
     tracks = CornerTracks(*tables, starts=starts, size=(480, 640), exposure_time=timing.exposure_time)
-    times = np.arange(-0.04, 0.8, 1e-3)
-    own = in_axes(axes, rates_of(times, 3.0))
-    recording = rsv.AngularRates(torch.from_numpy(times + OFFSET), torch.from_numpy(own + np.array(BIAS)))
-    found = align_rates(tracks, replace(timing, row_time=4.5e-5), recording, fit_row_time=True)
+    found = align_rates(tracks, replace(timing, row_time=4.5e-5), recorded(axes, 3.0, count=22), fit_row_time=True)
     assert found.reliable, found.reasons
     assert found.orientation == axes
     assert abs(found.offset - OFFSET) < min(4 * found.offset_std, 3e-4)

@@ -1,7 +1,5 @@
 """Files that cannot be read or written: a one-line message, and no incomplete output."""
 
-import os
-import re
 import struct
 import zlib
 
@@ -18,29 +16,36 @@ from rsvib_torch.io import check_stack_target, read_stack, read_stack_info, writ
 FRAMES = torch.rand(3, 9, 7, generator=torch.Generator().manual_seed(1))
 
 
-def tiff_bytes(tmp_path, kind):
-    path = tmp_path / "good.tif"
-    stored = (FRAMES.numpy() * 4095).astype("uint16")
-    if kind == "ours":
-        write_stack(path, FRAMES, dtype="uint16", full_scale=4095)
-    elif kind == "pages":
-        with tifffile.TiffWriter(path, bigtiff=True) as tif:
-            for frame in stored:
-                tif.write(frame, metadata=None)
-    else:
-        tifffile.imwrite(path, stored, photometric="minisblack", compression="zlib", metadata=None)
-    return path.read_bytes()
+COUNTS = (FRAMES.numpy() * 4095).astype("uint16")
 
 
-@pytest.mark.parametrize("kind", ["ours", "pages", "packed"])
-def test_tiff_truncated_anywhere_is_refused(tmp_path, kind):
-    data = tiff_bytes(tmp_path, kind)
-    path = tmp_path / "cut.tif"
-    needed = len(data) if kind != "ours" else len(data) - 16  # the last bytes are the resolution of the last page
-    for length in range(needed % 3, needed, 3):
-        path.write_bytes(data[:length])
-        with pytest.raises(ValueError, match=r"cut\.tif: (not a readable TIFF|truncated|frame \d cannot be)") as caught:
-            read_stack(path, full_scale=4095)
+def write_pages(path):
+    with tifffile.TiffWriter(path, bigtiff=True) as tif:
+        for frame in COUNTS:
+            tif.write(frame, metadata=None)
+
+
+WRITERS = {  # the file, and how many of its last bytes are not needed
+    "ours.tif": (lambda path: write_stack(path, FRAMES, dtype="uint16", full_scale=4095), 16),  # the resolution
+    "pages.tif": (write_pages, 0),
+    "packed.tif": (
+        lambda path: tifffile.imwrite(path, COUNTS, photometric="minisblack", compression="zlib", metadata=None),
+        0,
+    ),
+    "a.png": (lambda path: write_stack(path, FRAMES[:1], dtype="uint8"), 0),
+    "a.npy": (lambda path: np.save(path, COUNTS), 0),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_files_that_are_truncated_anywhere_are_refused(tmp_path, name):
+    write, more = WRITERS[name]
+    write(tmp_path / name)
+    data = (tmp_path / name).read_bytes()
+    for length in range(len(data) - more):
+        (tmp_path / name).write_bytes(data[:length])
+        with pytest.raises(ValueError, match=rf"{name}: (not a readable|truncated|frame \d cannot be)") as caught:
+            read_stack(tmp_path / name, full_scale=4095)
         assert "\n" not in str(caught.value)
 
 
@@ -61,9 +66,6 @@ def test_png_damage_is_refused(tmp_path):
     write_stack(tmp_path / "good.png", FRAMES[:1], dtype="uint8")
     data = (tmp_path / "good.png").read_bytes()
     path = tmp_path / "bad.png"
-    for length in range(len(data)):
-        path.write_bytes(data[:length])
-        refuses(lambda: read_stack(path), r"bad\.png: not a readable PNG")
     for place in range(8, len(data) - 4, 5):  # behind the pixels is the checksum of the end
         path.write_bytes(data[:place] + bytes([data[place] ^ 4]) + data[place + 1 :])
         refuses(lambda: read_stack(path), r"bad\.png")
@@ -84,9 +86,6 @@ def test_npy_damage_is_refused(tmp_path):
     path = tmp_path / "frames.npy"
     np.save(path, np.zeros((3, 9, 7), np.uint8))
     data = path.read_bytes()
-    for length in range(len(data)):
-        path.write_bytes(data[:length])
-        refuses(lambda: read_stack(path), r"frames\.npy: (truncated|not a readable \.npy)")
     path.write_bytes(data.replace(b"(3, 9, 7)", b"(3, 9" + b"9" * 3 + b")"))
     refuses(lambda: read_stack_info(path), "truncated: the header states")
     np.save(path, np.array([{"a": 1}], dtype=object), allow_pickle=True)
@@ -100,21 +99,6 @@ def test_npy_damage_is_refused(tmp_path):
     ):
         np.save(path, np.zeros(shape, np.uint8))
         refuses(lambda: read_stack(path), message)
-
-
-def test_videos_that_cannot_be_read(tmp_path, capfd):
-    for name, data in (("noise.avi", os.urandom(5000)), ("empty.mp4", b""), ("head.mp4", b"\0\0\0\x20ftypisom" * 9)):
-        (tmp_path / name).write_bytes(data)
-        with pytest.raises(ValueError, match=rf"{re.escape(name)}: not a readable video"):
-            read_stack(tmp_path / name)
-    writer = cv2.VideoWriter(str(tmp_path / "cut.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 24, (64, 48))
-    for _ in range(20):
-        writer.write(np.random.default_rng(1).integers(0, 255, (48, 64, 3), np.uint8))
-    writer.release()
-    data = (tmp_path / "cut.avi").read_bytes()
-    (tmp_path / "cut.avi").write_bytes(data[: len(data) // 2])
-    refuses(lambda: read_stack(tmp_path / "cut.avi"), r"cut\.avi: .* truncated: \d+ frames, 0\.\d+ of 0\.833 s")
-    assert capfd.readouterr().err == ""
 
 
 def test_png_folder_with_other_frames_is_not_written(tmp_path):

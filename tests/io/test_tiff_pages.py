@@ -36,11 +36,13 @@ def write_pages(path, pages, options=lambda i: {}, **file_options):
 
 
 def check_frames(path, expected):
+    """Compare the frames of a file, read in any order; returns what is known of the stack."""
     reader = open_stack(path)
     assert (reader.info.shape, reader.info.dtype) == (expected.shape, expected.dtype.name)
     for index in (len(expected) - 1, *range(len(expected))):
         np.testing.assert_array_equal(reader.frame(index), expected[index])
     reader.close()
+    return reader.info
 
 
 @pytest.mark.parametrize(

@@ -237,10 +237,23 @@ def test_files_that_are_not_videos_are_refused(tmp_path, monkeypatch):
         frame.sample_rate = 48000
         output.mux(audio.encode(frame))
         output.mux(audio.encode())
-    (tmp_path / "text.mov").write_text("no video")
-    for name, reason in (("sound.mp4", "it contains no video stream"), ("text.mov", "Invalid data found when")):
-        with pytest.raises(ValueError, match=rf"^{name}: not a readable video stack: {reason}"):
-            read_stack(name)
+    for name, data in (("text.mov", b"no video"), ("empty.mp4", b""), ("head.mp4", b"\0\0\0\x20ftypisom" * 9)):
+        (tmp_path / name).write_bytes(data)
+        refuses(lambda name=name: read_stack(name), rf"^{name}: not a readable video stack: ")
+    refuses(lambda: read_stack("sound.mp4"), "^sound.mp4: not a readable video stack: it contains no video stream")
+
+
+@pytest.mark.parametrize(("name", "codec", "encoded"), [("a.avi", "mjpeg", "yuvj420p"), ("a.mkv", "ffv1", "bgr0")])
+def test_truncated_videos_are_refused(tmp_path, capfd, name, codec, encoded):
+    """The container states its duration; 4 of 6 frames were read without a word."""
+    write_video(
+        tmp_path / name, noise(8, 3), TIMES, layout="rgb24", codec=codec, encoded=encoded, unit=Fraction(1, 30), rate=30
+    )
+    assert read_stack_info(tmp_path / name).shape == (6, 3, 48, 64)
+    data = (tmp_path / name).read_bytes()
+    (tmp_path / name).write_bytes(data[: 2 * len(data) // 3])
+    refuses(lambda: read_stack_info(tmp_path / name), rf"{name}: .*truncated: \d frames")
+    assert capfd.readouterr().err == ""
 
 
 def test_frames_keep_their_places_behind_one_that_cannot_be_decoded(tmp_path):

@@ -16,14 +16,6 @@ TIMING = SensorTiming(row_time=8e-5, exposure_rows=20, frame_rows=300)
 ORIENTATIONS = [(-2, "forward"), (-2, "reverse"), (-1, "forward"), (-1, "reverse")]
 
 
-def test_displacement_field():
-    """A roll of theta moves a point right of the centre down, and a point below the centre to the left."""
-    components = torch.tensor([1.0, 2.0, 1e-3, 2e-3], dtype=torch.float64)
-    assert displacement_at(components, torch.tensor(100.0).double(), torch.tensor(0.0).double()).tolist() == [1.2, 2.1]
-    moved = displacement_at(components, torch.tensor(0.0).double(), torch.tensor(100.0).double())
-    torch.testing.assert_close(moved, torch.tensor([0.9, 2.2], dtype=torch.float64))
-
-
 @given(st.tuples(*[st.floats(-3, 3)] * 4), st.floats(-200, 200), st.floats(-100, 100), st.sampled_from(ORIENTATIONS))
 def test_row_order_is_a_reflection_of_the_field(values, x, y, orientation):
     """The displacement of a turned point by the turned motion is the turned displacement."""

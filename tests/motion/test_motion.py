@@ -95,24 +95,15 @@ def test_detached_motion_has_no_gradients():
 
 
 TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
-AMPLITUDE = np.array([[3.1, 0.4], [5.2, 0.7]])
-FREQUENCY = np.array([[50.0, 155.0], [30.0, 88.0]])
-PHASE = np.array([[0.4, -1.0], [1.3, 2.2]])
-MOTION = np.array([120.0, -40.0])
-
-
-def vibration():
-    return Vibration(*(torch.from_numpy(part) for part in (AMPLITUDE, FREQUENCY, PHASE, MOTION)))
-
-
-def displacement(times):
-    angle = 2 * np.pi * FREQUENCY * times[..., None, None] + PHASE
-    return (AMPLITUDE * np.sin(angle)).sum(-1) + MOTION * times[..., None]
 
 
 def test_displacement_is_equation_1():
     times = np.linspace(-0.1, 0.3, 57).reshape(3, 19)
-    assert vibration().displacement(torch.from_numpy(times)).numpy() == pytest.approx(displacement(times), abs=1e-12)
+    t = times[..., None]
+    x = 3.1 * np.sin(100 * np.pi * t + 0.4) + 0.4 * np.sin(310 * np.pi * t - 1.0) + 90 * t + 15 * t**2 - 3
+    y = 5.2 * np.sin(60 * np.pi * t + 1.3) + 0.7 * np.sin(176 * np.pi * t + 2.2) - 40 * t + 200 * t**2 + 7
+    found = TONES.displacement(torch.from_numpy(times)).numpy()
+    assert found == pytest.approx(np.concatenate([x, y], -1), abs=1e-11)
 
 
 def test_blind_frequencies():
@@ -140,9 +131,9 @@ def test_uneven_frames_are_blind_to_frequencies_that_displace_all_frames_alike()
 
 
 def test_tones_are_sorted_by_amplitude():
-    mixed = Vibration([[0.4, 3.1], [5.2, 0.7]], [[155.0, 50.0], [30.0, 88.0]], [[-1.0, 0.4], [1.3, 2.2]], MOTION)
-    for name in ("amplitude", "frequency", "phase", "image_motion"):
-        assert torch.equal(getattr(mixed, name), getattr(vibration(), name))
+    mixed = Vibration([[0.4, 3.1], [5.2, 0.7]], [[155.0, 50.0], [30.0, 88.0]], [[-1.0, 0.4], [1.3, 2.2]])
+    for name in ("amplitude", "frequency", "phase"):
+        assert torch.equal(getattr(mixed, name), getattr(TONES, name))
 
 
 @pytest.mark.parametrize(("scan_axis", "order"), [(-2, [0, 1]), (-1, [1, 0])])
@@ -158,58 +149,48 @@ def test_standard_deviations_in_image_axes(scan_axis, order):
 SAMPLED = np.arange(0, 0.2, 1e-3)
 CURVED = np.stack([6 * np.sin(40 * SAMPLED) * np.exp(-8 * SAMPLED), 4 * np.cumsum(np.sin(300 * SAMPLED**2)) / 20], -1)
 LONG_EXPOSURES = rsv.SensorTiming(row_time=4e-5, exposure_rows=40, frame_rows=400)
-
-
-def spline():
-    return CubicSpline(SAMPLED, CURVED, bc_type="natural")
-
-
-def natural():
-    return FreeMotion.through(SAMPLED, CURVED)
+SPLINE, NATURAL = CubicSpline(SAMPLED, CURVED, bc_type="natural"), FreeMotion.through(SAMPLED, CURVED)
 
 
 @pytest.mark.parametrize("clock", [1 - 1e-12, 1.0, 1 + 1e-12])
 def test_rounding_does_not_change_the_number_of_knots(clock):
     found = FreeMotion.from_samples(SAMPLED * clock, CURVED, spacing=1e-3 * clock)
-    assert found.coefficients.shape == natural().coefficients.shape
+    assert found.coefficients.shape == NATURAL.coefficients.shape
 
 
 def test_displacement_velocity_and_mean_are_those_of_a_natural_spline():
     times = np.random.default_rng(0).uniform(0.0, SAMPLED[-1], 200)
     given = torch.from_numpy(times)
-    assert np.allclose(natural().displacement(given).numpy(), spline()(times), atol=1e-6)
-    assert np.allclose(natural().velocity(given).numpy(), spline()(times, 1), atol=1e-3)
+    assert np.allclose(NATURAL.displacement(given).numpy(), SPLINE(times), atol=1e-6)
+    assert np.allclose(NATURAL.velocity(given).numpy(), SPLINE(times, 1), atol=1e-3)
     exposure = 1.6e-3
     starts = np.linspace(0, 0.19, 50)
-    mean = np.stack([spline().integrate(a, a + exposure) / exposure for a in starts])
-    assert np.allclose(natural().mean_displacement(torch.from_numpy(starts), exposure).numpy(), mean, atol=2e-6)
+    mean = np.stack([SPLINE.integrate(a, a + exposure) / exposure for a in starts])
+    assert np.allclose(NATURAL.mean_displacement(torch.from_numpy(starts), exposure).numpy(), mean, atol=2e-6)
 
 
 def test_motion_is_constant_beyond_its_ends():
-    ends = natural().displacement(torch.tensor([-1.0, 5.0], dtype=torch.float64)).numpy()
+    ends = NATURAL.displacement(torch.tensor([-1.0, 5.0], dtype=torch.float64)).numpy()
     assert np.allclose(ends, CURVED[[0, -1]], atol=1e-6)
-    assert not natural().velocity(torch.tensor([-1.0, 5.0])).any()
+    assert not NATURAL.velocity(torch.tensor([-1.0, 5.0])).any()
 
 
 def test_tones_are_added_to_the_spline():
     tones = rsv.Vibration([1.0, 0.5], [70.0, 90.0], [0.3, 0.4], [10.0, -5.0])
     whole = FreeMotion.through(SAMPLED, CURVED, tones)
     times = torch.linspace(0, 0.19, 30, dtype=torch.float64)
-    assert torch.allclose(whole.displacement(times), natural().displacement(times) + tones.displacement(times))
-    assert torch.allclose(whole.velocity(times), natural().velocity(times) + tones.velocity(times))
+    assert torch.allclose(whole.displacement(times), NATURAL.displacement(times) + tones.displacement(times))
+    assert torch.allclose(whole.velocity(times), NATURAL.velocity(times) + tones.velocity(times))
 
 
 def test_samples_at_uneven_times():
     times = np.sort(np.random.default_rng(1).uniform(0, 0.199, 300))
-    uneven = FreeMotion.from_samples(times, spline()(times))
+    uneven = FreeMotion.from_samples(times, SPLINE(times))
     inside = torch.linspace(0.01, 0.19, 100, dtype=torch.float64)
-    assert (uneven.displacement(inside) - natural().displacement(inside)).abs().amax() < 0.02
-
-
-FREE = Curve(spline())  # the same path for the independent simulator
+    assert (uneven.displacement(inside) - NATURAL.displacement(inside)).abs().amax() < 0.02
 
 
 def test_simulated_frames_equal_those_of_the_independent_simulator():
     scene = draw_scene(320 + 2 * MARGIN, 192 + 2 * MARGIN, 2)
-    frames = rsv.simulate_frames(torch.from_numpy(scene), LONG_EXPOSURES, natural(), 2, frame_size=(320, 192))
-    assert decibel(frames.numpy(), take_frames(scene, LONG_EXPOSURES, FREE, 2), rim=16) > 60
+    frames = rsv.simulate_frames(torch.from_numpy(scene), LONG_EXPOSURES, NATURAL, 2, frame_size=(320, 192))
+    assert decibel(frames.numpy(), take_frames(scene, LONG_EXPOSURES, Curve(SPLINE), 2), rim=16) > 60

@@ -20,39 +20,25 @@ def integral(amplitude, frequency, phase, ends):
 
 
 @pytest.mark.parametrize(("amplitude", "frequency", "phase"), CASES)
-def test_equation_2(amplitude, frequency, phase):
-    """A_a sin(omega t + phi - omega T_e / 2) with A_a = A sinc(f T_e), t at the end of the exposure."""
-    ends = ROWS * CAMERA.row_time + CAMERA.exposure_time
-    expected = integral(amplitude, frequency, phase, ends)
-    omega = 2 * np.pi * frequency
-    attenuated = amplitude * np.sinc(frequency * CAMERA.exposure_time)
-    assert attenuated * np.sin(omega * ends + phase - omega * CAMERA.exposure_time / 2) == pytest.approx(
-        expected, abs=1e-9
-    )
-    vibration = Vibration(amplitude, frequency, phase)
-    starts = CAMERA.row_starts(1, 2048)[0]
-    found = vibration.mean_displacement(starts, CAMERA.exposure_time)[:, 0].numpy()
-    assert found == pytest.approx(expected, abs=1e-9)
+def test_equations_2_and_4_with_its_sign(amplitude, frequency, phase):
+    """Eq. (2): A_a sin(omega t + phi - omega T_e / 2) with A_a = A sinc(f T_e), t at the end of the exposure.
 
-
-@pytest.mark.parametrize(("amplitude", "frequency", "phase"), CASES)
-def test_equation_4_with_its_sign(amplitude, frequency, phase):
-    """The offset y2 - y1 (not y1 - y2) is 2 A_a sin(pi f m T) cos(...), by numerical integration of Eq. (2)."""
+    Eq. (4): the offset y2 - y1 (not y1 - y2) is 2 A_a sin(pi f m T) cos(...).
+    """
     ends = ROWS * CAMERA.row_time + CAMERA.exposure_time
-    offset = integral(amplitude, frequency, phase, ends + CAMERA.frame_period) - integral(
-        amplitude, frequency, phase, ends
-    )
-    omega = 2 * np.pi * frequency
+    first, later = (integral(amplitude, frequency, phase, t) for t in (ends, ends + CAMERA.frame_period))
+    omega, middle = 2 * np.pi * frequency, ends - CAMERA.exposure_time / 2
     attenuated = amplitude * np.sinc(frequency * CAMERA.exposure_time)
+    assert attenuated * np.sin(omega * middle + phase) == pytest.approx(first, abs=1e-9)
     gain = 2 * np.sin(np.pi * frequency * CAMERA.frame_period)
-    middle = ends - CAMERA.exposure_time / 2 + CAMERA.frame_period / 2
-    printed = attenuated * gain * np.cos(omega * middle + phase)
-    assert printed == pytest.approx(offset, abs=1e-9)
-    assert np.abs(printed + offset).max() > 0.1 * amplitude
-    starts = CAMERA.row_starts(2, 2048)
-    vibration = Vibration(amplitude, frequency, phase)
-    found = vibration.offset(starts[0], starts[1], CAMERA.exposure_time)[:, 0].numpy()
-    assert found == pytest.approx(offset, abs=1e-9)
+    printed = attenuated * gain * np.cos(omega * (middle + CAMERA.frame_period / 2) + phase)
+    assert printed == pytest.approx(later - first, abs=1e-9)
+    assert np.abs(printed + later - first).max() > 0.1 * amplitude
+    vibration, starts = Vibration(amplitude, frequency, phase), CAMERA.row_starts(2, 2048)
+    mean = vibration.mean_displacement(starts[0], CAMERA.exposure_time)[:, 0].numpy()
+    assert mean == pytest.approx(first, abs=1e-9)
+    offset = vibration.offset(starts[0], starts[1], CAMERA.exposure_time)[:, 0].numpy()
+    assert offset == pytest.approx(later - first, abs=1e-9)
     assert vibration.gain(CAMERA.frame_period)[0, 0].item() == pytest.approx(gain, abs=1e-12)
 
 

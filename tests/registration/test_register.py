@@ -50,21 +50,6 @@ def test_offsets_against_truth(pair, paper_camera, method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("shift", [(0.3, -0.4), (3.5, 2.25)])
-def test_uniform_shift_to_subpixel(method, shift):
-    """A still scene moved as a whole between the frames: every band has the same offset."""
-    timing = SensorTiming(row_time=10e-6, exposure_rows=0.01, frame_rows=1000)
-    # this image motion displaces frames as a whole; within a frame it is negligible
-    motion = Motion(amplitude=(0.0, 0.0), image_motion=(shift[0] / 10e-3, shift[1] / 10e-3))
-    frames = recorded((512, 512), timing, motion, 2, seed=5)
-    curve = register_bands(frames, timing, method=method)
-    error = curve.offsets.numpy() - true_offsets(curve, timing, motion)
-    limit = {"projection": (0.05, 0.05), "ncc": (0.03, 0.05), "phase": (0.03, 0.03)}[method]
-    assert bool((np.sqrt(np.nanmean(error**2, axis=(0, 1))) < limit).all())
-    assert curve.good.double().mean() > 0.7
-
-
-@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("shift", [(-240.0, -150.0), (20.0, 300.0)])
 def test_push_scan_shift_of_hundreds_of_pixels(method, shift):
     """The frames are cut from one drawn scene at places far apart, so that the truth is a whole number of px."""

@@ -1,11 +1,11 @@
 """Empty frames and missing pixels do not affect other frames or the verdict on a restoration."""
 
-import warnings
 from functools import partial
 
 import numpy as np
 import pytest
 import torch
+from refusals import without_warning
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration
@@ -48,9 +48,7 @@ def test_frame_without_data_does_not_affect_joint_restoration():
 @pytest.mark.parametrize(("value", "rows", "count"), [(0.0, 20, 1), (0.3, 200, 2)])
 def test_constant_frames_are_unchanged_without_a_warning(value, rows, count):
     frames = torch.full((count, 160, 140), value)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        found = restore(frames, camera(rows), MOTION.vibration())
+    found = without_warning(restore, frames, camera(rows), MOTION.vibration())
     torch.testing.assert_close(found, frames, rtol=0, atol=1e-5)
     if count == 2:
         verdict = judge_restoration(frames, found, camera(rows), MOTION.vibration())
@@ -69,9 +67,7 @@ def test_narrow_frames(shape, method):
 def test_missing_columns_cause_no_warning(columns, count):
     frames = noisy_frames(count)[:, :128, :128]
     frames[..., 60 : 60 + columns] = float("nan")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        found = restore(frames, camera(), MOTION.vibration())
+    found = without_warning(restore, frames, camera(), MOTION.vibration())
     assert judge_restoration(frames, found, camera(), MOTION.vibration()).overall == "helps"
     late = Motion(MOTION.amplitude, MOTION.frequency, (MOTION.phase[0] + 3, MOTION.phase[1] + 3)).vibration()
     wrong = quietly(frames, camera(), late)
@@ -81,9 +77,7 @@ def test_missing_columns_cause_no_warning(columns, count):
 def test_pairs_with_a_frame_without_data_are_not_judged():
     frames = noisy_frames(3)
     frames[2] = float("nan")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        found = restore(frames, camera(), MOTION.vibration())
+    found = without_warning(restore, frames, camera(), MOTION.vibration())
     verdict = judge_restoration(frames, found, camera(), MOTION.vibration())
     assert verdict.outcome == ("helps", "unknown")
     assert verdict.findings[1] == (Reason("pixels_missing", None, 1.0, 0.5),)

@@ -1,19 +1,16 @@
 """Noise levels of frames: each estimator with generated scenes of known noise, and the policy that combines them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from scipy import ndimage
-from truth import Motion, draw_scene, take_frames
+from truth import Motion, draw_scene, recorded, take_frames
 
 from rsvib_torch import SensorTiming
 from rsvib_torch.restoration.frame_motion import frame_motion
-from rsvib_torch.restoration.noise import (
-    ESTIMATORS,
-    estimate_noise,
-    noise_floor,
-    noise_levels,
-)
+from rsvib_torch.restoration.noise import ESTIMATORS, estimate_noise, noise_floor, noise_levels
 
 TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
 
@@ -56,11 +53,16 @@ def test_blocks_with_ignored_pixels_are_excluded(shape):
     assert estimate_noise(filled, torch.ones_like(hidden)).isnan().all()
 
 
+def exposed(rows, count):
+    """Frames (T, 1, H, W) with noise 0.01, and their motion."""
+    timing = replace(TIMING, exposure_rows=rows)
+    frames = recorded((256, 208), timing, Motion(), count, 0.01, seed=12)[:, None]
+    return frames, frame_motion(Motion().vibration().expanded(1), timing, count, frames.shape[-2])
+
+
 @pytest.mark.parametrize(("rows", "dead"), [(20, "black"), (100, "not measured")])
 def test_empty_frames_are_assigned_the_noise_of_the_others(rows, dead):
-    timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
-    frames = torch.from_numpy(take_frames(draw_scene(336, 288, seed=12), timing, Motion(), 3, 0.01)).float()[:, None]
-    motion = frame_motion(Motion().vibration().expanded(1), timing, 3, frames.shape[-2])
+    frames, motion = exposed(rows, 3)
     whole = noise_levels(frames[None], motion)[0]
     ignore = None
     if dead == "not measured":
@@ -75,9 +77,7 @@ def test_empty_frames_are_assigned_the_noise_of_the_others(rows, dead):
 
 @pytest.mark.parametrize(("rows", "share"), [(100, 0.3), (20, 0.6)])
 def test_missing_pixels_do_not_affect_the_level(rows, share):
-    timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
-    frames = torch.from_numpy(take_frames(draw_scene(336, 288, seed=12), timing, Motion(), 2, 0.01)).float()[:, None]
-    motion = frame_motion(Motion().vibration().expanded(1), timing, 2, frames.shape[-2])
+    frames, motion = exposed(rows, 2)
     hidden = torch.zeros(frames.shape, dtype=torch.bool)
     hidden[..., : round(share * frames.shape[-1])] = True
     found = noise_levels(frames.masked_fill(hidden, 0.4)[None], motion, hidden[None])[0]

@@ -178,26 +178,10 @@ def test_results_move_between_devices(results):
     assert detection.offsets.times.device.type == "meta"
 
 
-DRAWN = {
-    "ClockAlignment",
-    "DetectionResult",
-    "FreeMotion",
-    "MotionCheck",
-    "MotionDetection",
-    "MtfCurve",
-    "OffsetCurve",
-    "RestorationVerdict",
-    "RotationAlignment",
-    "RowTimeCalibration",
-    "SweptTone",
-    "Vibration",
-}
-
-
 def test_results_are_drawn(results, tmp_path):
     for number, (name, result) in enumerate(results):
         path = tmp_path / f"{number}.png"
-        if name not in DRAWN:
+        if name in ("AngularRates", "VibrationStd"):
             with pytest.raises(TypeError, match=r"has no figure; these have one: ClockAlignment, DetectionResult, D"):
                 result.plot(path)
         elif name in ("OffsetCurve", "Vibration") and result.batch_shape:

@@ -1,6 +1,7 @@
 """Row time from motion, in frames of an independent camera and in displacements computed from the definition."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,27 +21,17 @@ HEIGHT, WIDTH, FRAMES = 192, 144, 5
 ROW_TIME, FRAME_ROWS = 6e-5, 240
 TIMING = rsv.SensorTiming(row_time=ROW_TIME, exposure_rows=8, frame_rows=FRAME_ROWS)
 RATE = 1 / (FRAME_ROWS * ROW_TIME)
-
-
-class Tones(Motion):
-    """3.1 px at 131 Hz along x and, unless it is off, 2.2 px at 97 Hz along y."""
-
-    def __init__(self, y=2.2):
-        self.y = y
-
-    def displacement(self, times):
-        turn = 2 * np.pi * times
-        return np.stack([3.1 * np.sin(131.0 * turn + 0.4), self.y * np.sin(97.0 * turn + 2.0)], axis=-1)
+TONES = Motion((3.1, 2.2), (131.0, 97.0), (0.4, 2.0))
 
 
 @pytest.fixture(scope="module", name="two_tones")
 def make_two_tones():
-    return recorded((HEIGHT, WIDTH), TIMING, Tones(), FRAMES, 0.005, seed=5)
+    return recorded((HEIGHT, WIDTH), TIMING, TONES, FRAMES, 0.005, seed=5)
 
 
 @pytest.fixture(scope="module", name="one_tone")
 def make_one_tone():
-    return recorded((HEIGHT, WIDTH), TIMING, Tones(y=0.0), FRAMES, 0.005, seed=5)
+    return recorded((HEIGHT, WIDTH), TIMING, replace(TONES, amplitude=(3.1, 0.0)), FRAMES, 0.005, seed=5)
 
 
 def test_row_time_of_two_tones(two_tones):

@@ -192,16 +192,6 @@ def test_memory_sizes_are_parsed():
             parse_memory(text)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [({"window": 1}, "window must be at least 2, got 1"), ({"memory": "1KB"}, "is too little")],
-)
-def test_invalid_options_are_errors_without_files(whole, tmp_path, options, message):
-    with pytest.raises(ValueError, match=message):
-        process_small(whole / "frames.tif", tmp_path / "out.tif", **options)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_colour_and_axis_order_are_kept(whole, tmp_path):
     grey = tifffile.imread(whole / "frames.tif")[:5]
     colour = np.stack([grey, grey // 2, grey // 4], axis=-1)

@@ -162,27 +162,23 @@ def test_a_vibration_faster_than_the_exposure_is_found():
     assert abs(np.angle(tone.coefficient * np.exp(-1j * (0.3 - np.pi / 2)))) < 0.2
 
 
-def test_a_vibration_that_decays_is_followed():
-    truth, decay = {0: (1.5, 37.0, 0.3), 1: (1.0, 53.0, 1.0)}, 0.8
-    path = fitted(recorded(truth, subject=False, decay=decay))[1]
-    for time in (0.15, 0.7, 1.4):
-        tones = {tone.axis: tone for tone in path.tones(time)}
-        assert len(path.tones(time)) == 2
-        for axis, (size, frequency, phase) in truth.items():
-            expected = size * np.exp(-time / decay) * np.exp(1j * (2 * np.pi * frequency * time + phase - np.pi / 2))
-            assert abs(tones[axis].coefficient - expected) < 0.06  # px
-
-
-def test_tones_that_sweep_are_followed():
-    truth, sweep = {0: (2.0, 40.0, 0.3), 1: (1.5, 63.0, 1.0)}, 24.0
-    path = fitted(recorded(truth, subject=False, sweep=sweep))[1]
+@pytest.mark.parametrize(
+    ("truth", "decay", "sweep", "times", "error"),
+    [
+        ({0: (1.5, 37.0, 0.3), 1: (1.0, 53.0, 1.0)}, 0.8, 0.0, (0.15, 0.7, 1.4), 0.06),  # px
+        ({0: (2.0, 40.0, 0.3), 1: (1.5, 63.0, 1.0)}, np.inf, 24.0, (0.3, 0.7, 1.2), 0.15),
+    ],
+)
+def test_tones_that_decay_or_sweep_are_followed(truth, decay, sweep, times, error):
+    path = fitted(recorded(truth, subject=False, decay=decay, sweep=sweep))[1]
     assert all(window.residual < path.allowed for window in path.windows)
-    for time in (0.3, 0.7, 1.2):
+    for time in times:
         for axis, (size, frequency, phase) in truth.items():
             tones = [tone for tone in path.tones(time) if tone.axis == axis]
             assert all(abs(tone.frequency - frequency - sweep * time) < 0.5 for tone in tones)
             turned = 2 * np.pi * (frequency + 0.5 * sweep * time) * time + phase - np.pi / 2
-            assert abs(sum(tone.coefficient for tone in tones) - size * np.exp(1j * turned)) < 0.15  # px
+            expected = size * np.exp(-time / decay) * np.exp(1j * turned)
+            assert abs(sum(tone.coefficient for tone in tones) - expected) < error
 
 
 def test_a_few_lights_are_followed_beside_flakes_that_one_frame_shows():

@@ -51,6 +51,12 @@ def errors(found, amplitude=A, frequency=F):
     )
 
 
+def phase_errors(found, index):
+    """Of a steady vibration, (2,) rad."""
+    truth = 2 * np.pi * F * (index / RATE) + np.array([0.5, 1.0])
+    return np.angle(np.exp(1j * (found.vibration.phase[:, 0].numpy() - truth)))
+
+
 @pytest.fixture(scope="module", name="steady")
 def make_steady():
     frames = taken(STEADY, 24)
@@ -82,10 +88,7 @@ def test_result_agrees_with_the_batch_within_the_standard_deviations(steady):
 
 def test_phase_counts_from_the_first_row_of_the_frame(steady):
     _, tracked = steady
-    found = tracked[-1].detection.vibration
-    truth = 2 * np.pi * F * (23 / RATE) + np.array([0.5, 1.0])
-    apart = np.angle(np.exp(1j * (found.phase[:, 0].numpy() - truth)))
-    assert np.abs(apart).max() < 0.01
+    assert np.abs(phase_errors(tracked[-1].detection, 23)).max() < 0.01
 
 
 def test_frames_are_restored_without_delay(steady):
@@ -138,10 +141,8 @@ def test_the_motion_of_late_frames_is_predicted(steady):
             continue
         assert tracked.measurements is None
         assert decibel(tracked.restored, still) > decibel(measured[index].restored, still) - 0.3
-        found = tracked.detection
-        assert np.abs(errors(found)).max() < 0.01
-        truth = 2 * np.pi * F * (index / RATE) + np.array([0.5, 1.0])
-        assert np.abs(np.angle(np.exp(1j * (found.vibration.phase[:, 0].numpy() - truth)))).max() < 0.01
+        assert np.abs(errors(tracked.detection)).max() < 0.01
+        assert np.abs(phase_errors(tracked.detection, index)).max() < 0.01
 
 
 def test_a_late_frame_whose_motion_is_uncertain_is_measured():
@@ -167,15 +168,8 @@ def test_the_number_of_tones_changes():
 
 def test_an_axis_is_reliable_after_one_of_its_tones_has_ended():
     """The tone that has ended is too small in every later frame, which is no reason against the other one."""
-    end = 12 / RATE
-
-    @dataclass(frozen=True)
-    class Ending(Sines):
-        def displacement(self, times):
-            further = (1.1 * np.sin(2 * np.pi * 98.0 * times)) * (times < end)
-            return super().displacement(times) + np.stack([further, 0 * times], -1)
-
-    *_, last = track(taken(Ending(), 24))
+    further = Sines(path=lambda t: (1.1 * np.sin(2 * np.pi * 98.0 * t) * (t < 12 / RATE), 0 * t))
+    *_, last = track(taken(further, 24))
     assert last.detection.reliable.tolist() == [True, True]
     assert np.abs(errors(last.detection)).max() < 0.02
 

@@ -4,17 +4,16 @@ import io
 import os
 import resource
 import signal
-import threading
 import time
 import urllib.error
 import urllib.parse
 import urllib.request
 from dataclasses import dataclass
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import cv2
 import numpy as np
 import pytest
+from attacks.live_sessions import streaming_camera
 from refusals import refuses
 from truth import draw_scene
 
@@ -61,12 +60,13 @@ def values(reader):
     return [int(frame.pixels[0, 0]) for frame in reader]
 
 
-def test_the_oldest_waiting_frames_are_dropped_and_counted():
-    reader = FrameReader(source := Numbers(), waiting=8)
+@pytest.mark.parametrize(("drops", "lost"), [(True, 42), (False, 0)])
+def test_the_oldest_waiting_frames_are_dropped_and_counted_unless_the_source_may_wait(drops, lost):
+    reader = FrameReader(source := Numbers(), waiting=8, drops=drops)
     reader.start()
     time.sleep(0.2)
-    assert values(reader) == list(range(42, 50))
-    assert reader.dropped == 42
+    assert values(reader) == list(range(lost, 50))
+    assert reader.dropped == lost
     reader.close()
     assert source.closed
 
@@ -77,14 +77,6 @@ def test_a_reader_that_is_stopped_releases_the_source_with_the_next_frame(drops)
     reader.start()
     reader.close()
     assert source.closed
-
-
-def test_a_source_that_may_wait_loses_no_frame():
-    reader = FrameReader(Numbers(), waiting=8, drops=False)
-    reader.start()
-    time.sleep(0.1)
-    assert values(reader) == list(range(50))
-    assert reader.dropped == 0
 
 
 def test_an_error_of_the_source_arrives_behind_its_frames():
@@ -115,31 +107,11 @@ def test_missing_frames_of_a_camera_are_counted_and_late_ones_are_not(stamps, dr
 
 
 def test_a_camera_at_an_address():
-    """Motion JPEG over HTTP, as network cameras send it."""
     coloured = np.zeros((12, 48, 64, 3), np.uint8)  # blue, green, red
     coloured[..., 2] = 20 * np.arange(12)[:, None, None]
-    parts = [cv2.imencode(".jpg", frame)[1].tobytes() for frame in coloured]
-
-    class Stream(BaseHTTPRequestHandler):
-        def do_GET(self):
-            self.send_response(200)
-            self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=part")
-            self.end_headers()
-            for part in parts:
-                self.wfile.write(b"--part\r\nContent-Type: image/jpeg\r\n\r\n" + part + b"\r\n")
-                time.sleep(1 / 30)
-
-        def log_message(self, *arguments):
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Stream)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    try:
-        source = video.CameraSource(f"http://127.0.0.1:{server.server_address[1]}/video.mjpg", TIMING)
+    with streaming_camera(frames=12, begins=True, pictures=list(coloured)) as camera:
+        source = video.CameraSource(camera.url, TIMING)
         frames = list(source.frames())
-    finally:
-        server.shutdown()
-        server.server_close()
     assert len(frames) >= 10  # the last one may be incomplete
     reds = np.array([frame.pixels[0].mean() for frame in frames])
     assert frames[0].pixels.shape == (3, 48, 64)
@@ -254,18 +226,6 @@ def test_the_end_of_a_reader_ends_a_session():
     assert report.frames == 0
 
 
-class Broken:
-    """An output that cannot write."""
-
-    closed = None
-
-    def write(self, frame, index):
-        raise OSError("disk full")
-
-    def close(self):
-        self.closed = True
-
-
 def test_frames_before_an_error_of_the_source_are_not_lost(tmp_path):
     source = Numbers(3, error=OSError("unplugged"))
     output = video.VideoOutput(tmp_path / "video.mkv", 30.0)
@@ -325,14 +285,8 @@ def test_frames_at_uneven_intervals_are_written(tmp_path):
 
 
 def test_sizes_that_the_codec_cannot_hold_are_named(tmp_path):
-    output = video.VideoOutput(tmp_path / "video.mp4", 30.0)
+    source, output = Numbers(), video.VideoOutput(tmp_path / "video.mp4", 30.0)
     message = r"video\.mp4: H\.264 needs an even height and width, got \(1, 1\); write \.mkv"
-    refuses(lambda: video.run_live(Numbers(), rsv.VibrationTracker(TIMING), [output]), message)
+    refuses(lambda: video.run_live(source, rsv.VibrationTracker(TIMING), [output]), message)
     assert not any(tmp_path.iterdir())
-
-
-def test_an_error_of_an_output_ends_the_session(tmp_path):
-    source, output = Numbers(), Broken()
-    refuses(lambda: video.run_live(source, rsv.VibrationTracker(TIMING), [output], drops=False), "disk full", OSError)
-    assert output.closed
-    assert source.closed
+    assert source.closed  # an error of an output ends the session

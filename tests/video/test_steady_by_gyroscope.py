@@ -1,19 +1,17 @@
 """Videos steadied by a gyroscope, against an independent camera that turns: a subject fills most of its frame."""
 
-import itertools
 import json
 
 import numpy as np
 import pytest
 import torch
 from gpmf_file import add_track, packet, write_rates
-from rotating_camera import FOCAL_LENGTH, OFFSET, TIMING, recorded, take
+from program import refused, rsvib
+from rotating_camera import FOCAL_LENGTH, OFFSET, TIMING, recorded, take, unrelated_rates
 from scipy.spatial.transform import Rotation
-from skimage.registration import phase_cross_correlation
-from small_video import sound_of, write_video
+from small_video import shifts, sound_of, write_sharp
 
 import rsvib_torch as rsv
-from rsvib_torch.commands.main import run_command
 from rsvib_torch.video import process_video
 from rsvib_torch.video.recorded_rotation import RecordedRotation
 from rsvib_torch.video.steadying import steady_shifts
@@ -43,17 +41,18 @@ def make_place(tmp_path_factory):
 
 def write_clip(path, frames):
     counts = np.repeat(np.clip(np.round(255 * frames.numpy()), 0, 255).astype(np.uint8)[..., None], 3, -1)
-    encoder = {"codec": "libx264", "encoded": "yuv420p", "options": {"crf": "6", "threads": "1"}, "sound": "aac"}
-    write_video(path, counts, np.arange(len(counts)) * TIMING.frame_period, layout="rgb24", rate=30, **encoder)
+    write_sharp(path, counts, np.arange(len(counts)) * TIMING.frame_period, sound="aac")
+
+
+def steady_command(clip, folder):
+    steadied = ("--video", "--steady", "0.333", "--method", "dewarp", "--device", "cpu")
+    return ("run", clip, folder / "out", *CAMERA, *steadied)
 
 
 def shaking(path):
     """Rms displacement (px) of the distant scene from frame to frame."""
     strips = rsv.read_stack(path).double().mean(1).numpy()[:, *STRIP]
-    window = np.hanning(strips.shape[1])[:, None] * np.hanning(strips.shape[2])
-    pairs = itertools.pairwise((strip - strip.mean()) * window for strip in strips)
-    moved = [phase_cross_correlation(a, b, upsample_factor=50, normalization=None)[0] for a, b in pairs]
-    return np.sqrt(np.square(moved[2:-2]).sum(-1).mean())
+    return np.sqrt(np.square(shifts(strips)[2:-2]).sum(-1).mean())
 
 
 def test_the_scene_behind_a_large_subject_becomes_steady(place, tmp_path):
@@ -75,12 +74,10 @@ def test_a_fisheye_lens(place, tmp_path, capsys):
     lens["distortion_coeffs"] = [-0.6, 0.2, 0.0, 0.0]  # moves the corners by 9 px
     profile = {"calib_dimension": {"w": 432, "h": 400}, "fisheye_params": lens}  # of frames that are twice as large
     (tmp_path / "lens.json").write_text(json.dumps(profile))
-    write_clip(tmp_path / "clip.mp4", take(TIMING, SHAKING, count=16, fisheye=np.array(lens["distortion_coeffs"])))
-    steadied = ["run", str(tmp_path / "clip.mp4"), str(tmp_path / "out"), *CAMERA, "--video", "--steady", "0.333"]
-    steadied += ["--method", "dewarp", "--device", "cpu", "--lens-profile", str(tmp_path / "lens.json")]
-    assert run_command(steadied) == 2
-    assert "--lens-profile goes with --gyroscope" in capsys.readouterr().err
-    assert run_command([*steadied, "--gyroscope", str(place / "rates.csv")]) == 0
+    write_clip(tmp_path / "clip.mp4", take(TIMING, SHAKING, count=16, fisheye=lens["distortion_coeffs"]))
+    steadied = (*steady_command(tmp_path / "clip.mp4", tmp_path), "--lens-profile", tmp_path / "lens.json")
+    assert "--lens-profile goes with --gyroscope" in refused(capsys, *steadied)
+    assert rsvib(*steadied, "--gyroscope", place / "rates.csv") == 0
     assert shaking(tmp_path / "out" / "restored.mp4") < 0.15  # 0.54 without, or the alignment is refused
     assert rsv.read_manifest(tmp_path / "out" / "manifest.json").gyroscope["focal_length"] == FOCAL_LENGTH
 
@@ -89,14 +86,12 @@ def test_the_track_of_the_clip_itself(place, tmp_path, capsys):
     rates = rates_of_clip()
     clip = tmp_path / "clip.mp4"
     clip.write_bytes((place / "clip.mp4").read_bytes())
-    arguments = ["run", str(clip), str(tmp_path / "out"), *CAMERA, "--video", "--steady", "0.333", "--method", "dewarp"]
-    arguments += ["--gyroscope", "auto", "--device", "cpu", "--json"]
-    assert run_command(arguments) == 2
-    assert "without a GPMF track" in capsys.readouterr().err
+    arguments = (*steady_command(clip, tmp_path), "--gyroscope", "auto", "--json")
+    assert "without a GPMF track" in refused(capsys, *arguments)
     assert not (tmp_path / "out").exists()
     firsts = range(0, len(rates.times) - 299, 300)  # samples of 1 ms
     add_track(clip, [packet(rates.rates[first : first + 300].numpy(), total=first + 300) for first in firsts])
-    assert run_command(arguments) == 0
+    assert rsvib(*arguments) == 0
     data = json.loads(capsys.readouterr().out)
     assert shaking(tmp_path / "out" / "restored.mp4") < 0.15
     before, after = data["shaking"]["frame_to_frame"]
@@ -105,16 +100,9 @@ def test_the_track_of_the_clip_itself(place, tmp_path, capsys):
 
 
 def test_rates_of_another_camera_are_refused(place, tmp_path, capsys):
-    rates = rates_of_clip()
-    noise = np.random.default_rng(4).standard_normal((len(rates.times), 3))
-    smooth = np.stack([np.convolve(column, np.hanning(25) / 12, "same") for column in noise.T], -1)
-    write_rates(tmp_path / "other.csv", rsv.AngularRates(rates.times, torch.from_numpy(0.3 * smooth)))
-    arguments = ["run", str(place / "clip.mp4"), str(tmp_path / "out"), *CAMERA, "--video", "--steady", "1"]
-    arguments += ["--frames", "0:10"]
-    assert run_command([*arguments, "--gyroscope", str(tmp_path / "other.csv"), "--device", "cpu"]) == 2
-    printed = capsys.readouterr().err.strip()
-    assert "does not fit the video" in printed
-    assert len(printed.splitlines()) == 1
+    write_rates(tmp_path / "other.csv", unrelated_rates(rates_of_clip().times))
+    arguments = (*steady_command(place / "clip.mp4", tmp_path), "--frames", "0:10")
+    assert "does not fit the video" in refused(capsys, *arguments, "--gyroscope", tmp_path / "other.csv")
     assert [path.name for path in tmp_path.iterdir()] == ["other.csv"]
 
 
