@@ -153,7 +153,7 @@ def displacement_spectrum(
         tensor(np.where(blind, np.nan, np.stack(noises))),
         tensor(blind),
         motion_of_fit(_fit_of_lines(lines, measured.centre))[0],
-        0.5 / step,
+        2 * step,
     )
 
 

@@ -435,10 +435,10 @@ def check_motion(frames: FramesOrFiles, timing: SensorTiming, motion: Motion, op
     turned = motion.to("cpu").to_row_order(timing)
     used = tensor(measured.weights[0].min(-1) > 0)
 
-    rest = residual_of_motion(measured, turned)
+    unexplained = residual_of_motion(measured, turned)
     offsets, residual = (
         offsets_from_row_order(tensor(np.diff(values[0], axis=1)[:, 0])[used], timing)
-        for values in (measured.displacements, rest)
+        for values in (measured.displacements, unexplained)
     )
     before, after = _rms(offsets), _rms(residual)
     findings = []
