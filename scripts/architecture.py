@@ -42,11 +42,11 @@ LAYERS: tuple[dict[str, str], ...] = (
 # Parts of packages, from the lowest layer to the highest; packages that are not listed have one layer.
 INNER_LAYERS: dict[str, tuple[set[str], ...]] = {
     "detection": (
-        {"spectrum"},
-        {"measurements", "result"},
+        {"measurements"},
         {"strips"},
         {"tones"},
-        {"start"},
+        {"start", "spectrum"},
+        {"result"},
         {"rows", "sensitivity", "verdict"},
         {"assemble", "convergence"},
         {"refinement"},

@@ -131,6 +131,15 @@ class Measurements:
         names = ("exposure_starts", "displacements", "visible", "information")
         return replace(self, **{name: getattr(self, name)[:, rows] for name in names})
 
+    def of_axis(self, axis: int) -> "Measurements":
+        """The measurements of one axis by itself."""
+        return replace(
+            self,
+            displacements=self.displacements[..., axis : axis + 1],
+            information=self.inverse_variances[..., axis, None, None],
+            average_times=(self.average_times[axis % 2 if axis < 2 else 0],) * 2,
+        )
+
     def scaled(self, factor: Array) -> "Measurements":
         """The measurements with their information multiplied by factors (B, N, 2) of each axis."""
         root = np.sqrt(factor)

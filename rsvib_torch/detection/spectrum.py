@@ -14,6 +14,8 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.checks.values import check_single
+from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.detection.tones.fit import MotionModel, ToneFit, fit_roughly, motion_of_fit
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.numerics.fourier import fourier_sums
@@ -132,28 +134,16 @@ def displacement_spectrum(
         good &= (torch.isfinite(curve.std) & (curve.std > 0)).all(-1)
     if int(good.sum()) < 8:
         raise ValueError(f"a spectrum needs at least 8 measured offsets, got {int(good.sum())}; use more frames")
-    offsets, quality = table((curve.offsets - fitted)[good]), table(curve.quality[good])
-    std = np.ones_like(offsets) if curve.std is None else table(curve.std[good])
-    earlier, later = (table(times[good]) + 0.5 * timing.exposure_time for times in (curve.times, curve.later_times))
-    centre = 0.5 * (earlier.min() + later.max())
-    span = float(later.max() - earlier.min())
+    measured = _measurements(curve, good, fitted, timing)
     # Rows of bands that overlap are averaged: above the rate of separate bands, their errors would be amplified.
     spacing = float(curve.rows.diff().median()) if len(curve.rows) > 1 else timing.frame_rows
     spacing = max(spacing, *curve.heights)
-    step = 0.5 / span
+    step = 0.5 / float(measured.span[0])
     frequency = step * np.arange(2, max(math.floor(0.5 / (spacing * timing.row_time) / step), 8) + 1)
-    found = []
-    for axis in range(offsets.shape[-1]):
-        height = curve.heights[axis % 2 if axis < 2 else 0]
-        record = _Offsets(
-            earlier - centre,
-            later - centre,
-            offsets[:, axis],
-            quality / np.square(std[:, axis]),
-            timing.exposure_time,
-            height * timing.row_time,
-        )
-        found.append(record.spectrum(frequency, span, _lines_of(vibration, axis, centre)))
+    found = [
+        _spectrum(measured.of_axis(axis), frequency, _lines_of(vibration, axis, measured.centre))
+        for axis in range(measured.displacements.shape[-1])
+    ]
     amplitudes, noises, lines, responses = zip(*found, strict=True)
     # a frequency is blind if it is for any axis
     blind = np.any([response < _BLIND_GAIN * response.max() for response in responses], 0)
@@ -162,111 +152,79 @@ def displacement_spectrum(
         tensor(np.where(blind, np.nan, np.stack(amplitudes))),
         tensor(np.where(blind, np.nan, np.stack(noises))),
         tensor(blind),
-        _tones(lines, centre),
-        1 / span,
+        motion_of_fit(_fit_of_lines(lines, measured.centre))[0],
+        2 * step,
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Offsets:
-    """Offsets of one axis and their times, from which a spectrum is computed."""
-
-    earlier: Array  # (N,) s, mid-exposures of the rows in the earlier frame, from the middle of the record
-    later: Array  # (N,) s, those in the later frame
-    values: Array  # (N,) px, displacement at ``later`` less that at ``earlier``, without the lines that are known
-    weights: Array  # (N,) px^-2, inverse variances up to a factor
-    exposure_time: float  # s
-    band_time: float  # s, time over which the rows of one offset are exposed
-
-    def spectrum(self, frequency: Array, span: float, known: Array) -> tuple[Array, Array, Array, Array]:
-        """Amplitudes (F,), noise (F,), lines (L, 2) as frequency and complex amplitude, and the response (F,).
-
-        ``frequency`` (F,) Hz has equal steps that begin at twice the step, ``span`` is the duration in s, and ``known``
-        (K, 2) are lines that the values do not contain.
-        """
-        grid = float(frequency[1] - frequency[0]), 2, len(frequency)
-        times = np.concatenate([self.later, self.earlier])[None, :, None]
-        # Response of an offset to a displacement of each frequency, and its sum over the offsets.
-        attenuation = self._attenuation(frequency)
-        intervals = fourier_sums((self.later - self.earlier)[None, :, None], self.weights[None, :, None], grid)[0]
-        energy = 2 * (self.weights.sum() - intervals.real)
-        energy = np.maximum(energy, 1e-12 * energy.max())
-        response = np.abs(attenuation) * np.sqrt(energy)
-        visible, shown = (response >= gain * response.max() for gain in (_BLIND_GAIN, _SEARCHED_GAIN))
-        searched = shown
-        threshold = math.log(len(frequency) / 2 / _FALSE_ALARM)
-        lines = np.zeros((0, 2), complex)
-        while True:
-            # The residual as a tone of each frequency; the mean and a drift are image motion.
-            residual = self._without(lines)
-            parts = self.weights * residual
-            sums = fourier_sums(times, np.concatenate([parts, -parts])[None, :, None], grid)[0].conj()
-            power = np.square(np.abs(sums)) / energy
-            level = float(np.median(power[visible])) / math.log(2)  # the power of white noise is exponential
-            excess = np.where(searched, power / max(level, 1e-300), 0.0)
-            if excess.max() < threshold or len(lines) == _MAX_LINES:
-                break
-            # The line that is most significant, then all lines together. A line beside another one, or at a frequency
-            # that the offsets do not show, is an error of the others.
-            peak = frequency[excess.argmax()]
-            refined = self._refined(np.concatenate([lines, [[peak, 0.0]]]), span)
-            at = np.sort(refined[:, 0].real)
-            if (np.diff(at) < 0.25 / span).any() or not np.interp(at, frequency, shown.astype(float)).all():
-                searched = searched & (np.abs(frequency - peak) > 0.5 / span)
-            else:
-                lines = refined
-        complex_amplitude = sums / (0.5 * np.where(visible, attenuation, np.inf) * energy)
-        lines = np.concatenate([known, lines])
-        # the width of a line is chosen so that the integral of its PSD is half of its squared amplitude
-        places, sizes = (frequency - lines[:, :1].real) * span, lines[:, 1:]
-        complex_amplitude = complex_amplitude + (sizes * np.exp(-0.5 * np.pi * np.square(places))).sum(0)
-        noise = 2 * np.sqrt(level / energy) / np.maximum(np.abs(attenuation), 1e-12)
-        return np.abs(complex_amplitude), noise, lines, response
-
-    def _attenuation(self, frequency: Array) -> Array:
-        """Displacement that an offset keeps of a tone: averages over the exposure and over the rows."""
-        return np.sinc(frequency * self.exposure_time) * np.sinc(frequency * self.band_time)
-
-    def _design(self, lines: Array) -> Array:
-        """Derivatives (N, 3 L + 2) of the offsets by real part, imaginary part and frequency of lines, and by drift."""
-        frequency, amplitude = lines[:, 0].real, lines[:, 1]
-        waves = [unit_wave(2 * np.pi * frequency * times[:, None]) for times in (self.later, self.earlier)]
-        factor = self._attenuation(frequency)
-        offset = factor * (waves[0] - waves[1])
-        slope = 2j * np.pi * factor * (self.later[:, None] * waves[0] - self.earlier[:, None] * waves[1]) * amplitude
-        drift = [self.later - self.earlier, 0.5 * (np.square(self.later) - np.square(self.earlier))]
-        return np.concatenate([offset.real, -offset.imag, slope.real, np.stack(drift, -1)], 1)
-
-    def _solved(self, design: Array, count: int) -> Array:
-        """Weighted least-squares parameters of a design of ``count`` lines; combinations that it hardly shows are 0."""
-        root = np.sqrt(self.weights)[:, None]
-        scale = np.linalg.norm(root * design, axis=0)
-        # columns of one unit have one scale, so that a line without response is not enlarged
-        for part in (slice(0, 2 * count), slice(2 * count, design.shape[1] - 2)):
-            scale[part] = scale[part].max(initial=0.0)
-        scale = np.maximum(scale, 1e-300)
-        scaled = root * design / scale
-        normal, right = scaled.T @ scaled, scaled.T @ (root[:, 0] * self.values)
-        return np.linalg.lstsq(normal, right, rcond=1e-7)[0] / scale
-
-    def _refined(self, lines: Array, span: float) -> Array:
-        """Lines after three Gauss-Newton steps of all amplitudes and frequencies; the first sets new amplitudes."""
-        count = len(lines)
-        for _ in range(3):
-            real, imaginary, shift = self._solved(self._design(lines), count)[: 3 * count].reshape(3, count)
-            frequency = lines[:, 0].real + np.clip(shift, -0.25 / span, 0.25 / span)  # within the main lobe
-            lines = np.stack([np.maximum(frequency, 0.5 / span), real + 1j * imaginary], -1)
-        return lines
-
-    def _without(self, lines: Array) -> Array:
-        """Offsets (N,) without the lines and the drift."""
-        design = self._design(lines)
-        kept = np.r_[: 2 * len(lines), 3 * len(lines) : design.shape[1]]
-        return self.values - design[:, kept] @ self._solved(design[:, kept], len(lines))
+def _measurements(curve: OffsetCurve, good: Tensor, fitted: Tensor, timing: SensorTiming) -> Measurements:
+    """The good offsets of one stack, without those that are ``fitted``, weighted by their quality and variance."""
+    offsets, quality = table((curve.offsets - fitted)[good]), table(curve.quality[good])
+    std = np.ones_like(offsets) if curve.std is None else table(curve.std[good])
+    starts = np.stack([table(times[good]) for times in (curve.times, curve.later_times)], -1)
+    weights = quality[:, None] / np.square(std)
+    return Measurements(
+        starts[None],
+        np.stack([-0.5 * offsets, 0.5 * offsets], 1)[None],
+        visible=np.ones((1, *starts.shape)),
+        information=(weights[..., None] * np.eye(weights.shape[-1]))[None],
+        exposure_time=timing.exposure_time,
+        average_times=(curve.heights[0] * timing.row_time, curve.heights[1] * timing.row_time),
+    )
 
 
-def _lines_of(vibration: Vibration, axis: int, centre: float) -> Array:
-    """Lines (K, 2) of the tones of an axis, inverse of ``_tones``."""
+def _spectrum(measured: Measurements, frequency: Array, known: Array) -> tuple[Array, Array, Array, Array]:
+    """Amplitudes (F,), noise (F,), lines (L, 2) as frequency and complex amplitude, and the response (F,), of an axis.
+
+    ``frequency`` (F,) Hz has equal steps that begin at twice the step, and ``known`` (K, 2) are lines that the
+    displacements do not contain.
+    """
+    span, grid = float(measured.span[0]), (float(frequency[1] - frequency[0]), 2, len(frequency))
+    times, weights = measured.middles[..., 0, 0], measured.weights[..., 0]  # (1, N, 2), (1, N)
+    # Response of an offset to a displacement of each frequency, and its sum over the offsets.
+    attenuation = np.sinc(frequency * measured.smearing_times[:, 0]).prod(0)[0]
+    intervals = fourier_sums(np.diff(times), weights[..., None], grid)[0]
+    energy = 2 * (weights.sum() - intervals.real)
+    energy = np.maximum(energy, 1e-12 * energy.max())
+    response = np.abs(attenuation) * np.sqrt(energy)
+    visible, shown = (response >= gain * response.max() for gain in (_BLIND_GAIN, _SEARCHED_GAIN))
+    searched = shown
+    threshold = math.log(len(frequency) / 2 / _FALSE_ALARM)
+    fit, residual = _fitted(measured, np.zeros(0))
+    while True:
+        # The residual as a tone of each frequency; the mean and a drift are image motion.
+        sums = fourier_sums(times, 2 * weights[..., None] * residual[..., 0], grid)[0].conj()
+        power = np.square(np.abs(sums)) / energy
+        level = float(np.median(power[visible])) / math.log(2)  # the power of white noise is exponential
+        excess = np.where(searched, power / max(level, 1e-300), 0.0)
+        if excess.max() < threshold or fit.active.shape[-1] == _MAX_LINES:
+            break
+        # The line that is most significant, then all lines together. A line beside another one, or at a frequency
+        # that the offsets do not show, is an error of the others.
+        peak = frequency[excess.argmax()]
+        trial, rest = _fitted(measured, np.append(fit.frequencies, peak))
+        at = np.sort(trial.frequencies[0, 0])
+        if (np.diff(at) < 0.25 / span).any() or not np.interp(at, frequency, shown.astype(float)).all():
+            searched = searched & (np.abs(frequency - peak) > 0.5 / span)
+        else:
+            fit, residual = trial, rest
+    complex_amplitude = sums / (0.5 * np.where(visible, attenuation, np.inf) * energy)
+    lines = np.concatenate([known, np.stack([fit.frequencies[0, 0], fit.coefficients[0, 0]], -1)])
+    # the width of a line is chosen so that the integral of its PSD is half of its squared amplitude
+    places, sizes = (frequency - lines[:, :1].real) * span, lines[:, 1:]
+    complex_amplitude = complex_amplitude + (sizes * np.exp(-0.5 * np.pi * np.square(places))).sum(0)
+    noise = 2 * np.sqrt(level / energy) / np.maximum(np.abs(attenuation), 1e-12)
+    return np.abs(complex_amplitude), noise, lines, response
+
+
+def _fitted(measured: Measurements, frequencies: Array) -> tuple[ToneFit, Array]:
+    """The lines of an axis, fitted from frequencies (L,), and the residual displacements."""
+    start = frequencies[None, None]
+    return fit_roughly(measured, start, np.ones_like(start, dtype=bool), MotionModel(drift_order=2), iterations=3)
+
+
+def _lines_of(vibration: Vibration, axis: int, centre: Array) -> Array:
+    """Lines (K, 2) of the tones of an axis, complex amplitudes of ``exp(2 pi i f (t - centre))``."""
     amplitude, frequency, phase = (
         table(values[axis]) for values in (vibration.amplitude, vibration.frequency, vibration.phase)
     )
@@ -274,14 +232,11 @@ def _lines_of(vibration: Vibration, axis: int, centre: float) -> Array:
     return lines[amplitude > 0]
 
 
-def _tones(lines: tuple[Array, ...], centre: float) -> Vibration:
-    """Lines of each axis, complex amplitudes of ``exp(2 pi i f (t - centre))``, as a vibration."""
-    values = np.zeros((3, len(lines), max(1, *map(len, lines))))
+def _fit_of_lines(lines: tuple[Array, ...], centre: Array) -> ToneFit:
+    """Lines of each axis as a fit, inverse of ``_lines_of``."""
+    values = np.zeros((2, 1, len(lines), max(1, *map(len, lines))), complex)
     for axis, of_axis in enumerate(lines):
-        frequency, amplitude = of_axis[:, 0].real, of_axis[:, 1]
-        # Re(C exp(i w t)) = |C| sin(w t + arg C + pi / 2)
-        phase = np.angle(amplitude) + 0.5 * np.pi - 2 * np.pi * frequency * centre
-        wrapped = np.mod(phase + np.pi, 2 * np.pi) - np.pi
-        values[:, axis, : len(of_axis)] = np.abs(amplitude), frequency, wrapped
-    amplitude_of_axes, frequency_of_axes, phase_of_axes = map(tensor, values)
-    return Vibration(amplitude_of_axes, frequency_of_axes, phase_of_axes)
+        values[:, 0, axis, : len(of_axis)] = of_axis.T
+    frequencies, coefficients = values
+    drift, covariance = np.zeros((1, len(lines), 1)), np.zeros((1, 0, 0))
+    return ToneFit(coefficients, frequencies.real, coefficients != 0, drift, covariance, centre, MotionModel())

@@ -38,8 +38,7 @@ from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.numerics.splines import gauss_legendre
-from rsvib_torch.numerics.tables import Array, table, tensor
+from rsvib_torch.numerics.tables import Array, scaled_inverse, table, tensor
 from rsvib_torch.options import OffsetOptions
 from rsvib_torch.results.presentation import AXIS_NAMES, JudgedResult
 from rsvib_torch.results.reason import Reason
@@ -324,13 +323,12 @@ def fit_clock(
         middle = middle[..., None]
         columns = [speed, speed * middle, value * x, value * y, middle * x, middle * y]
         jacobian = measured.relative(np.stack(columns, -1)) * free
-        # 3. The normal equations, in units of the sizes of the columns, and the step.
+        # 3. The normal equations and the step.
         residual = residual_of_motion(measured, clock.motion(recorded))
         weighted = np.einsum("bnac,bngcq->bngaq", measured.information, jacobian)
         gram = np.einsum("bngap,bngaq->pq", jacobian, weighted)
         right = np.einsum("bngap,bnga->p", weighted, residual)
-        scale = np.sqrt(np.where(gram.diagonal() > 0, gram.diagonal(), 1.0))
-        inverse = np.linalg.pinv(gram / scale / scale[:, None], rcond=1e-10, hermitian=True) / scale / scale[:, None]
+        inverse = scaled_inverse(gram)
         change = inverse @ right
         known = max(float(measured.num_measurements.sum()), 8.0) - free.sum()
         covariance = inverse * (measured.square(residual).sum() / known)
@@ -437,12 +435,11 @@ def check_motion(frames: FramesOrFiles, timing: SensorTiming, motion: Motion, op
     turned = motion.to("cpu").to_row_order(timing)
     used = tensor(measured.weights[0].min(-1) > 0)
 
-    def of_bands(displacements: Tensor) -> Tensor:
-        """(N, 2) px, later less earlier displacement of pairs (1, N, 2, 2), in image axes."""
-        return offsets_from_row_order((displacements[0, :, 1] - displacements[0, :, 0])[used], timing)
-
-    offsets = of_bands(tensor(measured.displacements))
-    residual = offsets - of_bands(_averaged(turned, measured))
+    unexplained = residual_of_motion(measured, turned)
+    offsets, residual = (
+        offsets_from_row_order(tensor(np.diff(values[0], axis=1)[:, 0])[used], timing)
+        for values in (measured.displacements, unexplained)
+    )
     before, after = _rms(offsets), _rms(residual)
     findings = []
     for name, moved, rest in zip(AXIS_NAMES, before.tolist(), after.tolist(), strict=False):
@@ -456,17 +453,6 @@ def check_motion(frames: FramesOrFiles, timing: SensorTiming, motion: Motion, op
         findings.append(Reason("offsets_not_reduced", None, rest, moved))
     times = tensor(measured.exposure_starts[0, :, 0])[used]
     return MotionCheck(before, after, rest < moved, tuple(findings), times, offsets, residual)
-
-
-def _averaged(motion: Motion, measured: Measurements) -> Tensor:
-    """Mean displacement (1, N, 2, 2) over exposure and rows of the bands."""
-    duration = measured.average_times[1]
-    nodes, weights = gauss_legendre(3)
-    mean = torch.zeros_like(tensor(measured.displacements))
-    for node, weight in zip(nodes.tolist(), weights.tolist(), strict=True):
-        times = tensor(measured.exposure_starts) + (node - 0.5) * duration
-        mean = mean + weight * motion.mean_displacement(times, measured.exposure_time)
-    return mean
 
 
 def _rms(offsets: Tensor) -> Tensor:

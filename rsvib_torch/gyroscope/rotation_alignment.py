@@ -250,7 +250,7 @@ def _result(
     reasons += ambiguous + _uncertain(fit, std) + outside(offset, offset_std, offsets)
     steps = model.rates.times.diff()
     inside = (model.rates.times[1:] > clock[0]) & (model.rates.times[:-1] < clock[1])
-    longest, allowed = float(steps[inside].amax()), 4 * float(steps.median())
+    longest, allowed = max(steps[inside].tolist(), default=float(clock[1] - clock[0])), 4 * float(steps.median())
     if longest > allowed:
         reasons.append(Reason("gap_in_recording", None, longest, allowed))
     readout, shortest = row_time * rows, float(starts.diff(dim=1).amin())

@@ -24,6 +24,7 @@ from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, orientation_matr
 from rsvib_torch.gyroscope.rotation_search import MIN_FOCAL_LENGTH
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.numerics.splines import gauss_legendre
+from rsvib_torch.numerics.tables import scaled_inverse, table, tensor
 
 NAMES = ("bias x", "bias y", "bias z", "at", "scale", "focal length", "row time")
 _ROUNDS = 12  # of weights and variances; the clock changes by less than 0.1 of its std after 8 on the phone
@@ -255,8 +256,7 @@ def _solved(fit: RotationFit, linear: _Linear) -> tuple[RotationFit, Tensor, Ten
     usual = usual * (gram.diagonal() > 0)
     gram = gram + torch.diag(usual)
     right = right - usual * torch.cat([fit.parameters, fit.translation])
-    size = torch.where(gram.diagonal() > 0, gram.diagonal(), 1.0).sqrt()
-    covariance = torch.linalg.pinv(gram / size / size[:, None], rtol=1e-12, hermitian=True) / size / size[:, None]
+    covariance = tensor(scaled_inverse(table(gram)))
     change = covariance @ right
     # a step is at most a quarter of the focal length and of the row time, and 1 % of the scale
     limit = 0.25 * fit.parameters[5:7]

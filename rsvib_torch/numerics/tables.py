@@ -75,6 +75,14 @@ def pseudo_inverse(matrix: Array) -> Array:
     return np.linalg.pinv(matrix, rcond=max(matrix.shape[-2:]) * np.finfo(np.float64).eps)
 
 
+def scaled_inverse(matrix: Array) -> Array:
+    """Pseudo-inverse of normal matrices (..., P, P) of parameters of any units; 0 for what they do not determine."""
+    diagonal = matrix.diagonal(axis1=-2, axis2=-1)
+    unit = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    unit = unit[..., :, None] * unit[..., None, :]
+    return np.linalg.pinv(matrix * unit, rcond=1e-12, hermitian=True) * unit
+
+
 def tensor(values: Array) -> Tensor:
     """An array as a tensor on the CPU, for motions and for indices of tensors."""
     return torch.from_numpy(np.ascontiguousarray(values))

@@ -37,7 +37,7 @@ from rsvib_torch.detection.tones.uncertainty import linearised
 from rsvib_torch.detection.verdict import residual_reasons, with_remedy
 from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.timing import RowTiming
-from rsvib_torch.numerics.tables import Array, median, table, tensor
+from rsvib_torch.numerics.tables import Array, median, scaled_inverse, table, tensor
 from rsvib_torch.options import MAX_TONES, RegistrationOptions
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.results.presentation import AXIS_NAMES
@@ -183,7 +183,7 @@ def fit_row_tones(places: FramePlaces, axis: int, start: Array, *, iterations: i
         max_nfev=2 * iterations,
     )
     spare = max(1.0, float(places.measurements.num_measurements[0, axis]) - len(start))
-    covariance = np.linalg.pinv(found.jac.T @ found.jac, hermitian=True) * (2 * found.cost / spare)
+    covariance = scaled_inverse(found.jac.T @ found.jac) * (2 * found.cost / spare)
     return RowTones(found.x, covariance, measured - _model(places, found.x)[0], 2 * found.cost)
 
 

@@ -14,7 +14,7 @@ from scipy import ndimage
 from rsvib_torch.checks.arrays import Channels, FramesOrFiles, channel_axis
 from rsvib_torch.frames.loading import load_frames
 from rsvib_torch.frames.prepare import as_float_frames
-from rsvib_torch.numerics.tables import Array
+from rsvib_torch.numerics.tables import Array, scaled_inverse
 
 SceneModel = Literal["smooth", "fixed"]
 _TINY = 1e-300  # smallest divisor
@@ -109,7 +109,7 @@ def deviations(jacobian: Array, residual: Array, reach: int) -> Array:
     The derivatives of the model are (T, H, N), the residuals (T, H), weighted by Bartlett's window. The result is not
     smaller than for residuals without correlation.
     """
-    information = np.linalg.pinv(np.einsum("tin,tim->nm", jacobian, jacobian))
+    information = scaled_inverse(np.einsum("tin,tim->nm", jacobian, jacobian))
     score = jacobian * residual[..., None]
     reach = min(reach, residual.shape[1] - 1)
     window = 1 - np.abs(np.arange(-reach, reach + 1)) / (reach + 1)

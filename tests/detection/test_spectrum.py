@@ -109,6 +109,10 @@ def test_spectrum_of_frames_has_a_tone_that_the_detection_left_out():
     assert spectrum.lines.amplitude[0, :2].tolist() == pytest.approx([0.8, 0.1], rel=0.15)  # errors of up to 13 %
     assert spectrum.lines.frequency[0, :2].tolist() == pytest.approx([880 / 2 / math.pi, 2530 / 2 / math.pi], abs=0.2)
     assert spectrum.lines.amplitude[1, 0] == pytest.approx(0.3, rel=0.05)
+    assert spectrum.resolution == pytest.approx(1 / (23 / 60 + 232 * TIMING.row_time), rel=0.03)  # of 24 frames
+    assert spectrum.frequency.diff().tolist() == pytest.approx(
+        [0.5 * spectrum.resolution] * (len(spectrum.frequency) - 1)
+    )
 
 
 def test_overlapping_bands_have_no_lines_of_amplified_errors():

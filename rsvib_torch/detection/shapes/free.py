@@ -319,8 +319,11 @@ def rms_motion(measured: Measurements, motion: Motion) -> Array:
 
 
 def _moved(measured: Measurements, motion: Motion) -> Array:
-    """Displacements (1, N, G, 2) in px of the rows by a motion."""
-    return table(motion.mean_displacement(tensor(measured.exposure_starts), measured.exposure_time))
+    """Displacements (1, N, G, A) in px of the rows by a motion, means over the exposure and the rows of a band."""
+    starts, duration = tensor(measured.exposure_starts), measured.average_times[1]
+    nodes, shares = gauss_legendre(3 if duration else 1)
+    at_nodes = [motion.mean_displacement(starts + (node - 0.5) * duration, measured.exposure_time) for node in nodes]
+    return table(torch.stack(at_nodes, -1) @ shares)
 
 
 def band_errors(banded: Measurements, motion: Motion) -> list[float]:

@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
+from scipy.optimize import least_squares
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import check_shapes
@@ -37,7 +38,7 @@ from rsvib_torch.frames.orientation import findings_from_row_order, magnitudes_f
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.splines import gauss_legendre
-from rsvib_torch.numerics.tables import Array, split_axis, table, tensor, unit_wave
+from rsvib_torch.numerics.tables import Array, scaled_inverse, split_axis, table, tensor, unit_wave
 from rsvib_torch.options import SweptToneOptions
 from rsvib_torch.results.presentation import AXIS_NAMES, JudgedResult, axis_rows, verdict_lines, verdict_table
 from rsvib_torch.results.reason import Reason
@@ -52,6 +53,9 @@ _STARTS = 7.5  # starts over the squared number of periods of the highest freque
 _MAX_STARTS = 100_000  # the search takes 0.5 s for frames of 266 rows; a part of the record has fewer
 # probability; of 96 axes of frames of noise, 54 were reliable without this limit and 0 of 60 with it
 _MAX_CHANCE = 0.01
+_MOST_STEPS = 25  # evaluations of a fit from one start
+# factors of the parameters [a, b, f, g, c, v]: of the same tone with the opposite frequency, and of no tone
+_MIRRORED, _STILL = np.array([1.0, -1.0, -1.0, 1.0, -1.0, 1.0]), np.array([0.0, 0.0, 1.0, 1.0, 1.0, 1.0])
 _TONE = ("amplitude", "frequency", "decay", "chirp", "phase")
 _STD_SHAPES = dict.fromkeys(("amplitude", *(f"std[{name!r}]" for name in _TONE)), "... 2")
 
@@ -185,14 +189,14 @@ class _Fitted:
 
     # (2, 6) parameters [a, b, f, g, c, v] of each axis about the middle of the record: ``exp(-g s) (a cos(theta) + b
     # sin(theta)) + v s``, ``theta = 2 pi (f s + c s^2 / 2)``, s = t - middle
-    fits: Tensor
-    covariances: Tensor  # (2, 6, 6)
+    fits: Array
+    covariances: Array  # (2, 6, 6)
     record: tuple[float, float]  # its start and end in seconds
-    moved: Tensor  # (2,) px, rms motion of the rows
-    unexplained: Tensor  # (2,) px, rms displacement of rows beside it
-    uncertain: Tensor  # (2,) px, rms standard deviation of the motion of the rows
+    moved: Array  # (2,) px, rms motion of the rows
+    unexplained: Array  # (2,) px, rms displacement of rows beside it
+    uncertain: Array  # (2,) px, rms standard deviation of the motion of the rows
     against: list[list[Reason]]  # reasons against each axis from the offsets of row bands
-    others: list[Tensor | None]  # another fit (6,) of each axis that agrees with the rows as well, if there is one
+    others: list[Array | None]  # another fit (6,) of each axis that agrees with the rows as well, if there is one
     intervals: Array  # s, between the frames
 
 
@@ -209,10 +213,10 @@ def _detect(
     for axis in range(2):
         starts.append(_start(banded, axis, pairs, record, highest))
         step_done()
-    fits = torch.stack([of_axis[0] for of_axis in starts])
+    fits = np.stack([of_axis[0] for of_axis in starts])
 
     # 2. Rounds of measuring and fitting.
-    def motion_of(values: Tensor) -> FreeMotion:
+    def motion_of(values: Array) -> FreeMotion:
         return _motion(values, record, _step(values, record, rowwise))
 
     frames = grouped_frames(stack.images, stack.valid, rowwise, motion_of(fits).expanded(1).to(device))
@@ -222,27 +226,27 @@ def _detect(
         weighed = measured.reweighted(residual_of_motion(measured, motion))
         starts = [_with_aliases(of_axis, (record[1] - record[0]) / num_frames) for of_axis in starts]
         starts = [_settle(weighed, axis, record, starts[axis])[0][:4] for axis in range(2)]
-        fits = torch.stack([of_axis[0] for of_axis in starts])
+        fits = np.stack([of_axis[0] for of_axis in starts])
         step_done()
 
     # 3. The last fit, its uncertainty, and what else the rows agree with.
     solved = [_settle(weighed, axis, record, starts[axis]) for axis in range(2)]
-    fits, covariances, gains = (torch.stack([one[i][0] for one in solved]) for i in range(3))
-    fits = torch.where(gains[:, None] > F_THRESHOLD, fits, _still(fits))
+    fits, covariances, gains = (np.stack([one[i][0] for one in solved]) for i in range(3))
+    fits = np.where(gains[:, None] > F_THRESHOLD, fits, fits * _STILL)
     motion = motion_of(fits)
     residual = residual_of_motion(measured, motion)
     independent = float((weighed.independent_fraction(residual) * measured.share_counted(residual))[0])
     covariances = covariances / independent
     others = [_equally_good(*one, independent) for one in solved]
-    times = tensor(measured.exposure_starts[0]) + 0.5 * measured.exposure_time - 0.5 * (record[0] + record[1])
-    columns = torch.stack([_relative(measured, _columns(times, fit)) for fit in fits])
+    times = (measured.exposure_starts + 0.5 * measured.exposure_time - 0.5 * (record[0] + record[1]))[..., None]
+    columns = np.stack([measured.relative(_columns(times, fit, np.ones(1)))[0] for fit in fits])  # (2, N, G, 6)
     if rowwise.row_time_std:
-        by_row_time = tensor(displacements_by_row_time(measured, motion, rowwise, num_frames)[0])
-        heavy = tensor(weighed.inverse_variances[0]).sqrt()[:, None, :].expand(by_row_time.shape).movedim(-1, 0)
-        design, data = (heavy[..., None] * columns).flatten(1, 2), (heavy * by_row_time.movedim(-1, 0)).flatten(1)
-        changes = torch.linalg.lstsq(design, data[..., None], driver="gelsd").solution  # (2, 6, 1) of the parameters
-        covariances = covariances + changes @ changes.mT
-    variances = torch.einsum("angi,aij,angj->ang", columns, covariances, columns).clamp(min=0.0)
+        by_row_time = displacements_by_row_time(measured, motion, rowwise, num_frames)
+        changed = replace(weighed, displacements=weighed.displacements + by_row_time)
+        for axis, fit in enumerate(fits):
+            change = _settle(changed, axis, record, fit[None])[0][0] - fit
+            covariances[axis] += np.outer(change, change)
+    variances = np.maximum(((columns @ covariances[:, None]) * columns).sum(-1), 0.0)
 
     # 4. Reasons from the row bands.
     against = bands_reasons(start, width, motion)
@@ -255,9 +259,9 @@ def _detect(
         fits,
         covariances,
         record,
-        moved=tensor(rms_motion(measured, motion)),
-        unexplained=tensor(measured.unexplained(residual)[0]),
-        uncertain=variances.mean((1, 2)).sqrt(),
+        moved=rms_motion(measured, motion),
+        unexplained=measured.unexplained(residual)[0],
+        uncertain=np.sqrt(variances.mean((1, 2))),
         against=against,
         others=others,
         intervals=np.diff(table(rowwise.frame_starts(num_frames))),
@@ -285,47 +289,35 @@ def _chance(banded: Measurements, motion: FreeMotion, pairs: int, candidates: fl
     return np.minimum(candidates * left ** (0.5 * np.maximum(freedom - 2, 0)), 1.0).tolist()
 
 
-def _equally_good(fits: Tensor, covariances: Tensor, _: Tensor, excess: Tensor, independent: float) -> Tensor | None:
+def _equally_good(fits: Array, covariances: Array, _: Array, excess: Array, independent: float) -> Array | None:
     """A fit of ``_settle`` that the rows do not exclude, outside the stated error of the first one; None if none is."""
-    std = (covariances[0].diagonal()[2:5] / independent).clamp(min=0.0).sqrt()
-    distance = (fits - fits[0])[:, 2:5].abs() / std
-    other = (distance.amax(-1) > 2 * _MAX_STD) & (excess * independent < _MAX_STD**2)
-    return fits[other][0] if bool(other.any()) else None
+    std = np.sqrt(np.maximum(covariances[0].diagonal()[2:5] / independent, 1e-300))
+    distance = np.abs(fits - fits[0])[:, 2:5] / std
+    other = (distance.max(-1) > 2 * _MAX_STD) & (excess * independent < _MAX_STD**2)
+    return fits[other][0] if other.any() else None
 
 
-def _still(fits: Tensor) -> Tensor:
-    """Parameters (..., 6) with amplitude 0."""
-    return fits * fits.new_tensor([0.0, 0.0, 1.0, 1.0, 1.0, 1.0])
+def _waves(times: Array, fit: Array) -> Array:
+    """``exp(-g s) (cos(theta) + i sin(theta))`` of parameters (6,) at times s from the middle."""
+    return np.exp(-fit[3] * times) * unit_wave(2 * math.pi * times * (fit[2] + 0.5 * fit[4] * times))
 
 
-def _waves(times: Tensor, fits: Tensor) -> tuple[Tensor, Tensor]:
-    """Cosine and sine part at times S from the middle, of parameters (..., 6) broadcast against S."""
-    envelope = torch.exp(-fits[..., 3] * times)
-    angle = 2 * math.pi * (fits[..., 2] * times + 0.5 * fits[..., 4] * times.square())
-    return envelope * angle.cos(), envelope * angle.sin()
+def _value(times: Array, fit: Array) -> Array:
+    """Displacement in px at times from the middle."""
+    value: Array = (complex(fit[0], -fit[1]) * _waves(times, fit)).real + fit[5] * times
+    return value
 
 
-def _value(times: Tensor, fits: Tensor) -> Tensor:
-    """Displacement in px at times S from the middle."""
-    cosine, sine = _waves(times, fits)
-    return fits[..., 0] * cosine + fits[..., 1] * sine + fits[..., 5] * times
+def _columns(times: Array, fit: Array, shares: Array) -> Array:
+    """Derivatives (..., 6) by the parameters (6,) of the mean displacement over times (..., Q) with shares (Q,)."""
+    waves = _waves(times, fit)
+    by_rate = complex(fit[0], -fit[1]) * times * waves
+    mean, by_rate, by_chirp = waves @ shares, by_rate @ shares, (times * by_rate) @ shares
+    parts = [mean.real, mean.imag, -2 * math.pi * by_rate.imag, -by_rate.real, -math.pi * by_chirp.imag, times @ shares]
+    return np.stack(parts, -1)
 
 
-def _columns(times: Tensor, fits: Tensor) -> Tensor:
-    """Derivatives (..., 6) of the displacement by the parameters (..., 6)."""
-    cosine, sine = _waves(times, fits)
-    tone, quarter = fits[..., 0] * cosine + fits[..., 1] * sine, fits[..., 1] * cosine - fits[..., 0] * sine
-    turn = 2 * math.pi * times
-    whole = torch.broadcast_tensors(cosine, sine, turn * quarter, -times * tone, 0.5 * turn * times * quarter, times)
-    return torch.stack(whole, -1)
-
-
-def _relative(measured: Measurements, values: Tensor) -> Tensor:
-    """Values (N, G, P) less their mean over the frames that contain the row."""
-    return tensor(measured.relative(table(values)[None])[0])
-
-
-def _start(banded: Measurements, axis: int, pairs: int, record: tuple[float, float], highest: float) -> Tensor:
+def _start(banded: Measurements, axis: int, pairs: int, record: tuple[float, float], highest: float) -> Array:
     """Fits (S, 6), best first, to the offsets of the row bands of a number of frame pairs.
 
     Decay, sweep and frequency replace each other within a short record, so that fits from one start end in a minimum of
@@ -349,7 +341,7 @@ def _start(banded: Measurements, axis: int, pairs: int, record: tuple[float, flo
         first, end, fits = max(0, first - more), min(pairs, end + more), fits[:4]
 
 
-def _best_starts(banded: Measurements, axis: int, record: tuple[float, float], highest: float) -> Tensor:
+def _best_starts(banded: Measurements, axis: int, record: tuple[float, float], highest: float) -> Array:
     """Start parameters (S, 6) from a grid of frequencies, sweeps and decays: the four best of each decay.
 
     An offset is ``p(t') E(t') - p(t) E(t)`` with ``E = exp(2 pi i f t)`` and p of decay and sweep. All sums over the
@@ -405,104 +397,88 @@ def _best_starts(banded: Measurements, axis: int, record: tuple[float, float], h
         columns = np.zeros((len(chosen), 6))
         columns[:, 2], columns[:, 3], columns[:, 4] = frequencies[chosen] + chirp * about, decay, chirp
         starts.append(columns)
-    return tensor(np.concatenate(starts))
+    return np.concatenate(starts)
 
 
 def _settle(
-    measured: Measurements, axis: int, record: tuple[float, float], fits: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Levenberg-Marquardt from several starts (S, 6) side by side, for one axis of one stack.
+    measured: Measurements, axis: int, record: tuple[float, float], starts: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Levenberg-Marquardt from each of several starts (S, 6), for one axis of one stack.
 
     Best fit first: parameters (S, 6), covariances (S, 6, 6), decrease of chi-square per parameter (S,) by the tone, and
     chi-square less that of the best fit (S,).
     """
-    middle = 0.5 * (record[0] + record[1])
-    weight = tensor(measured.inverse_variances[0, :, axis])
-    values = tensor(measured.displacements[0, ..., axis] * measured.visible[0])
-    known = max(float(measured.num_measurements[0, axis]), 7.0)
-    row_weight = weight[:, None].expand_as(values)
-    # a displacement is a mean over the exposure and the rows of a band
+    # 1. Displacements are means over the exposure and the rows of a band, relative to the other frames.
     duration = measured.exposure_time + measured.average_times[axis]
-    first = tensor(measured.exposure_starts[0]) + 0.5 * (measured.exposure_time - duration) - middle
-    nodes, shares = gauss_legendre(4)
-    quadrature = list(zip((first[..., None] + duration * nodes).unbind(-1), shares.tolist(), strict=True))
+    first = measured.exposure_starts[0] + 0.5 * (measured.exposure_time - duration) - 0.5 * (record[0] + record[1])
+    nodes, shares = (table(values) for values in gauss_legendre(4))
+    times = first[..., None] + duration * nodes
+    root = np.sqrt(measured.inverse_variances[0, :, axis])
 
-    def averaged(function: Callable[[Tensor, Tensor], Tensor], at: Tensor) -> Tensor:
-        """(S, N, G, P) relative means over exposures of a function (N, G, S, P) of times and parameters."""
-        at_nodes = [share * function(time[..., None], at) for time, share in quadrature]
-        relative: Tensor = _relative(measured, torch.stack(at_nodes).sum(0).flatten(2)).unflatten(-1, (len(at), -1))
-        return relative.movedim(2, 0)
+    def whitened(values: Array) -> Array:
+        """Relative displacements (N, G, ...) in standard deviations, (N G, ...)."""
+        relative = measured.relative(values[None])[0]
+        return (root.reshape(-1, *(1,) * (values.ndim - 1)) * relative).reshape(-1, *values.shape[2:])
 
-    def residual_of(at: Tensor) -> Tensor:
-        return values - averaged(lambda time, fit: _value(time, fit)[..., None], at)[..., 0]
-
-    def cost_of(residual: Tensor) -> Tensor:
-        return (row_weight * residual.square()).sum((1, 2))
-
-    residual = residual_of(fits)
-    cost, damping = cost_of(residual), torch.full_like(fits[:, 0], 1e-3)
-    settled = torch.zeros_like(cost, dtype=torch.bool)
-    for _ in range(25):
-        # the opposite frequency, sweep and sine part are the same tone
-        fits = torch.where((fits[:, 2:3] < 0), fits * fits.new_tensor([1.0, -1.0, -1.0, 1.0, -1.0, 1.0]), fits)
-        design = averaged(_columns, fits).flatten(1, 2)  # (S, N G, 6)
-        weighted = (design * row_weight.flatten()[:, None]).mT
-        gram, right = weighted @ design, weighted @ residual.flatten(1)[..., None]
-        size = torch.where(gram.diagonal(dim1=-2, dim2=-1) > 0, gram.diagonal(dim1=-2, dim2=-1), 1.0)
-        trial = fits + torch.linalg.solve(gram + torch.diag_embed(damping[:, None] * size), right)[..., 0]
-        trial_residual = residual_of(trial)
-        gained = cost - cost_of(trial_residual)
-        better = (gained > 0) & ~settled
-        settled = settled | (better & (gained < 1e-9 * (cost - gained))) | (~better & (damping > 1e7))
-        fits = torch.where(better[:, None], trial, fits)
-        residual = torch.where(better[:, None, None], trial_residual, residual)
-        cost = torch.where(better, cost - gained, cost)
-        damping = torch.where(better, (0.1 * damping).clamp(min=1e-12), 10 * damping)
-        if bool(settled.all()):
-            break
-    without = residual_of(_still(fits))
-    drift = _relative(measured, first[..., None])[..., 0]
-    norm = (row_weight * drift.square()).sum() + 1e-300
-    drift_only = cost_of(without) - (row_weight * drift * without).sum((1, 2)).square() / norm
-    noise = cost / known
-    scale = size.sqrt()[..., None]
-    inverse = torch.linalg.pinv(gram / scale / scale.mT, rtol=1e-12, hermitian=True) / scale / scale.mT
-    best = cost.argsort()
-    gain, excess = (drift_only - cost) / (5 * noise + 1e-300), known * (cost / (cost.amin() + 1e-300) - 1)
-    return fits[best], (noise[:, None, None] * inverse)[best], gain[best], excess[best]
+    # 2. The fits, best first; the opposite frequency, sweep and sine part are the same tone.
+    data = whitened(measured.displacements[0, ..., axis])
+    found = [
+        least_squares(
+            lambda fit: whitened(_value(times, fit) @ shares) - data,
+            start,
+            lambda fit: whitened(_columns(times, fit, shares)),
+            method="lm",
+            x_scale="jac",
+            max_nfev=_MOST_STEPS,
+        )
+        for start in starts
+    ]
+    found.sort(key=lambda one: one.cost)
+    signs = np.array([_MIRRORED if one.x[2] < 0 else np.ones(6) for one in found])
+    jacobians = np.stack([one.jac for one in found]) * signs[:, None]
+    # 3. Their errors, and what they explain beside an image motion.
+    cost, known = 2 * np.array([one.cost for one in found]), max(float(measured.num_measurements[0, axis]), 7.0)
+    noise, drift = cost / known, whitened(first)
+    drift_only = data @ data - (drift @ data) ** 2 / (drift @ drift + 1e-300)
+    covariances = noise[:, None, None] * scaled_inverse(jacobians.mT @ jacobians)
+    gain, excess = (drift_only - cost) / (5 * noise + 1e-300), known * (cost / (cost[0] + 1e-300) - 1)
+    return np.array([one.x for one in found]) * signs, covariances, gain, excess
 
 
-def _step(fits: Tensor, record: tuple[float, float], timing: SensorTiming) -> float:
+def _step(fits: Array, record: tuple[float, float], timing: SensorTiming) -> float:
     """Seconds between the knots of a motion: 24 in the shortest period, for an error of its spline below 1e-4."""
     span = record[1] - record[0]
-    fastest = float((fits[:, 2].abs() + 0.5 * fits[:, 4].abs() * span).amax())
+    fastest = float((np.abs(fits[:, 2]) + 0.5 * np.abs(fits[:, 4]) * span).max())
     return max(min(1 / (24 * fastest + 1e-9), span / 64), timing.row_time)
 
 
-def _motion(fits: Tensor, record: tuple[float, float], step: float) -> FreeMotion:
+def _motion(fits: Array, record: tuple[float, float], step: float) -> FreeMotion:
     """Both axes as one spline with knots every ``step`` seconds."""
     middle, span = 0.5 * (record[0] + record[1]), record[1] - record[0]
-    times = torch.linspace(*record, math.ceil(span / step) + 1, dtype=torch.float64, device=fits.device)
-    return FreeMotion.through(times, torch.stack([_value(times - middle, fit) for fit in fits], -1))
+    times = np.linspace(*record, math.ceil(span / step) + 1)
+    return FreeMotion.through(tensor(times), tensor(np.stack([_value(times - middle, fit) for fit in fits], -1)))
 
 
-def _at_origin(fit: Tensor, middle: float) -> Tensor:
-    """[A, f, g, c, phi] at time 0 of parameters (6,) about the middle."""
-    a, b, frequency, decay, chirp, _ = fit.unbind()
-    phase = torch.atan2(a, b) - 2 * math.pi * (frequency * middle - 0.5 * chirp * middle**2)
-    amplitude = torch.hypot(a, b) * torch.exp(decay * middle)
-    return torch.stack([amplitude, frequency - chirp * middle, decay, chirp, phase])
+def _at_origin(fit: Array, middle: float) -> tuple[Array, Array]:
+    """[A, f, g, c, phi] at time 0 of parameters (6,) about the middle, and their derivatives (5, 6)."""
+    a, b, frequency, decay, chirp, _ = fit
+    size, growth = max(math.hypot(a, b), 1e-300), math.exp(decay * middle)
+    phase = math.atan2(a, b) - 2 * math.pi * (frequency * middle - 0.5 * chirp * middle**2)
+    slopes = np.eye(5, 6, 1)
+    slopes[0] = [a / size * growth, b / size * growth, 0.0, size * growth * middle, 0.0, 0.0]
+    slopes[1, 4] = -middle
+    slopes[4] = [b / size**2, -a / size**2, -2 * math.pi * middle, 0.0, math.pi * middle**2, 0.0]
+    return np.array([size * growth, frequency - chirp * middle, decay, chirp, phase]), slopes
 
 
-def _with_aliases(fits: Tensor, period: float) -> Tensor:
+def _with_aliases(fits: Array, period: float) -> Array:
     """Fits, and the first one at the frequencies that differ by up to three times the frame rate.
 
     Of 16 axes of tones that decay in 40 frames, one was found at such a frequency, and reliable.
     """
-    steps = fits.new_tensor([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
-    others = fits[:1].repeat(len(steps), 1)
-    others[:, 2] += steps / period
-    return torch.cat([fits, others[others[:, 2] > 0]])
+    others = np.tile(fits[0], (6, 1))
+    others[:, 2] += np.array([-3, -2, -1, 1, 2, 3]) / period
+    return np.concatenate([fits, others[others[:, 2] > 0]])
 
 
 def _report(fitted: _Fitted, timing: SensorTiming, step: float) -> SweptTone:
@@ -511,15 +487,13 @@ def _report(fitted: _Fitted, timing: SensorTiming, step: float) -> SweptTone:
     reverse, num_frames = timing.readout_direction == "reverse", len(fitted.intervals) + 1
     values, stds, findings = [], [], []
     for axis, (fit, covariance) in enumerate(zip(fitted.fits, fitted.covariances, strict=True)):
-        present = bool(fit[:2].abs().sum() > 0)
-        value = _at_origin(fit, middle)
-        with torch.inference_mode(False):  # which has no derivatives
-            slope = torch.autograd.functional.jacobian(lambda p: _at_origin(p, middle), fit.clone())
-        std = (slope @ covariance @ slope.mT).diagonal().clamp(min=0.0).sqrt()
+        present = bool(np.abs(fit[:2]).sum() > 0)
+        value, slope = _at_origin(fit, middle)
+        std = np.sqrt(np.maximum((slope @ covariance @ slope.T).diagonal(), 0.0))
         turned = math.pi if reverse and axis == 1 else 0.0  # displacement along the scan changes its sign
-        value[4] = torch.remainder(value[4] + turned + math.pi, 2 * math.pi) - math.pi
-        values.append(value if present else 0 * value)
-        stds.append(std if present else 0 * std)
+        value[4] = np.mod(value[4] + turned + math.pi, 2 * math.pi) - math.pi
+        values.append(present * value)
+        stds.append(present * std)
         name = AXIS_NAMES[axis]
         against = [] if present else [Reason("no_tone", name)]
         if present and num_frames < _MIN_FRAMES:
@@ -545,14 +519,14 @@ def _report(fitted: _Fitted, timing: SensorTiming, step: float) -> SweptTone:
     for axis, name in enumerate(AXIS_NAMES[:2]):
         if wrong[1 - axis] and not findings[axis]:
             findings[axis] = (Reason("other_axis_unknown", name),)
-    reliable = torch.tensor([not against for against in findings], device=fitted.fits.device)
-    parameters, deviations = (magnitudes_from_row_order(torch.stack(x, -1), timing) for x in (values, stds))
+    reliable = torch.tensor([not against for against in findings], device="cpu")
+    parameters, deviations = (magnitudes_from_row_order(tensor(np.stack(x, -1)), timing) for x in (values, stds))
     return SweptTone(
         **dict(zip(_TONE, parameters, strict=True)),
-        image_motion=offsets_from_row_order(fitted.fits[:, 5], timing),
+        image_motion=offsets_from_row_order(tensor(fitted.fits[:, 5]), timing),
         std=dict(zip(_TONE, deviations, strict=True)),
         motion=_motion(fitted.fits, fitted.record, step).from_row_order(timing),
-        unexplained=magnitudes_from_row_order(fitted.unexplained, timing),
+        unexplained=magnitudes_from_row_order(tensor(fitted.unexplained), timing),
         reliable=magnitudes_from_row_order(reliable, timing),
         findings=findings_from_row_order(findings, timing),
     )
