@@ -6,7 +6,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, ParamSpec, Protocol, overload
+from typing import ParamSpec, Protocol, overload
 
 import numpy as np
 import torch
@@ -159,7 +159,7 @@ class _AlignsMotion(Protocol[P]):
     ) -> RotationAlignment: ...
 
 
-def _align_options(options: Callable[P, AlignOptions]) -> Callable[[Callable[..., Any]], _AlignsMotion[P]]:
+def _align_options(options: Callable[P, AlignOptions]) -> Callable[[Callable[..., object]], _AlignsMotion[P]]:
     return lambda function: entry_point(options, function)
 
 

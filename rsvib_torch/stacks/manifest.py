@@ -10,7 +10,6 @@ from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from statistics import median, stdev
-from typing import Any
 
 import numpy as np
 import torch
@@ -340,11 +339,11 @@ def manifest_header(job: StackJob, output: str | None, compression: str | None) 
     }
 
 
-def stack_manifest(header: Table, records: Iterable[WindowRecord], **results: Any) -> StackManifest:
+def stack_manifest(header: Table, records: Iterable[WindowRecord]) -> StackManifest:
     """The manifest of a run, from its header and the records of all windows."""
     windows = tuple(records)
     bad = {index: reason for record in windows for index, reason in record.bad_frames.items()}
-    return StackManifest(**header, bad_frames=bad, windows=windows, **results)
+    return StackManifest(**header, bad_frames=bad, windows=windows)
 
 
 @checks_arguments
