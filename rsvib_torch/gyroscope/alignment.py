@@ -216,7 +216,7 @@ def align_motion(
             f"got {type(recorded).__name__}"
         )
     if isinstance(recorded, FreeMotion):
-        check_single("recorded", recorded)
+        check_single("recorded", recorded.batch_shape)
     if isinstance(recorded, FreeMotion) and (options.camera is not None or options.fit_row_time):
         raise ValueError("camera and fit_row_time are for angular rates (read_gyroscope); omit them for a FreeMotion")
     stack = grey_frames(frames, timing, options)
@@ -430,7 +430,7 @@ def check_motion(frames: FramesOrFiles, timing: SensorTiming, motion: Motion, op
         raise TypeError(f"motion must be a Motion, got {described(motion)}")
     stack = grey_frames(frames, timing, options)
     timing = stack.timing
-    check_single("motion", motion)
+    check_single("motion", motion.batch_shape)
     if stack.batched:
         raise ValueError("check_motion takes one stack, not a batch")
     measured = start_of_stack(stack, timing, options)[1].measurements

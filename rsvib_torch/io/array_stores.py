@@ -9,8 +9,8 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -66,9 +66,7 @@ def _reader(
 
 # HDF5
 
-
-def _h5py() -> ModuleType:
-    return needed_package("h5py", "reading and writing HDF5", "formats")
+_h5py = partial(needed_package, "h5py", "reading and writing HDF5", "formats")
 
 
 def _find_dataset(file: File) -> Dataset:
@@ -165,9 +163,7 @@ def write_hdf5(path: Path, info: StackInfo, frames: Iterator[Array], compression
 
 # Zarr
 
-
-def _zarr() -> ModuleType:
-    return needed_package("zarr", "reading and writing Zarr", "formats")
+_zarr = partial(needed_package, "zarr", "reading and writing Zarr", "formats")
 
 
 def _check_sizes(array: Stored, info: StackInfo, folder: Path) -> None:

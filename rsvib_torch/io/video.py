@@ -11,11 +11,10 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Se
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import lru_cache
+from functools import lru_cache, partial
 from io import BytesIO
 from itertools import chain, count, islice, pairwise, repeat
 from pathlib import Path
-from types import ModuleType
 from typing import IO, TYPE_CHECKING, Literal
 
 import numpy as np
@@ -51,10 +50,7 @@ _GOPRO_FIRMWARE = {
     "HD7.01": "GoPro HERO7 Black",
 }  # the first characters of its version
 _FRAMES = 8  # decoded frames of a decoder; each has at most 6 bytes per pixel
-
-
-def _av() -> ModuleType:
-    return needed_package("av", "reading and writing video", "video")
+_av = partial(needed_package, "av", "reading and writing video", "video")
 
 
 def open_container(video: Path | IO[bytes]) -> InputContainer:

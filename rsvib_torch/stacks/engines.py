@@ -7,7 +7,7 @@ from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import closing, suppress
 from dataclasses import replace
-from types import ModuleType
+from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
 import torch
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 _Result = TypeVar("_Result")
+_distributed = partial(needed_package, "distributed", "the Dask engine", "distributed")
 NO_WORKERS_SECONDS = 60.0  # workers of a batch system start within this time after those before them ended
 
 
@@ -38,10 +39,6 @@ def compute_here(
     # Sums of floats depend on the number of threads: results must not depend on how many windows are computed at once.
     threads = torch.get_num_threads() if all(window.alone for window in windows) else 1
     return in_threads(compute, read_windows(job, windows), at_once=at_once, threads=threads)
-
-
-def _distributed() -> ModuleType:
-    return needed_package("distributed", "the Dask engine", "distributed")
 
 
 def _compute_on_worker(job: StackJob, window: Window) -> StoredWindow:

@@ -76,8 +76,7 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
     @cached_property
     def timing(self) -> SensorTiming:
         """The sensor."""
-        found: SensorTiming = decode(SensorTiming, self.settings.get("sensor"), "settings.sensor")
-        return found
+        return decode(SensorTiming, self.settings.get("sensor"), "settings.sensor")
 
     def summary(self) -> str:
         """Tones over the windows, what was restored, and what failed."""

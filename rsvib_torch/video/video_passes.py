@@ -34,7 +34,7 @@ from rsvib_torch.results.reason import Reason
 from rsvib_torch.stacks.job import stored_frame
 from rsvib_torch.stacks.recorded_motion import compared_pairs
 from rsvib_torch.stacks.window_restoration import pair_verdict
-from rsvib_torch.stacks.windows import WindowRecord
+from rsvib_torch.stacks.windows import WindowRecord, record_fields
 from rsvib_torch.video import Margins
 from rsvib_torch.video.camera_path import SIGNIFICANT, WINDOW_FRAMES, CameraPath, Tone, WindowPath, camera_path, shake
 from rsvib_torch.video.recorded_rotation import RecordedRotation
@@ -261,11 +261,10 @@ class VideoPasses:
                 )
                 if not sizes.any()
             ]
-        return WindowRecord.of(
-            verdict,
-            {track.index: track.fault for track in tracks if track.fault is not None},
-            detection,
-            restored=any(bool(track.motion.moving_axes().any()) for track in tracks if track.fault is None),
+        faults = {track.index: track.fault for track in tracks if track.fault is not None}
+        moved = any(bool(track.motion.moving_axes().any()) for track in tracks if track.fault is None)
+        return WindowRecord(
+            **record_fields(verdict, faults, detection, restored=moved),
             window=part,
             first=tracks[0].index,
             last=tracks[-1].index,
