@@ -17,7 +17,7 @@ from rsvib_torch.detection.tones.fit import MotionModel, ToneFit
 from rsvib_torch.execution.parallel import ONE_BLAS_THREAD, prefetched
 from rsvib_torch.gyroscope.corner_tracks import followed_pair, tracks_of_pairs
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
-from rsvib_torch.gyroscope.rotation_alignment import RotationAlignment, align_rates
+from rsvib_torch.gyroscope.rotation_alignment import AlignOptions, RotationAlignment, align_rates
 from rsvib_torch.io.full_scale import counts_to_frames
 from rsvib_torch.io.video import VideoReader
 from rsvib_torch.motion.camera import Camera
@@ -125,7 +125,7 @@ class VideoPasses:
         for _ in found.pairs(progress):  # for ``found.compared``, and for ``found.corners``
             pass
         tracks = tracks_of_pairs(found.compared, self.starts, timing, self.frames.size)
-        aligned = align_rates(tracks, timing, self.rates, self.camera)
+        aligned = align_rates(tracks, timing, self.rates, AlignOptions(camera=self.camera))
         if not aligned.reliable:
             source, reasons = self.rates.source, "; ".join(aligned.reasons)
             raise ValueError(f"the gyroscope ({source}) does not fit the video: {reasons}")
