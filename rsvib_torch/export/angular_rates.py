@@ -141,5 +141,4 @@ def _body_rates(vector: Array, slope: Array) -> Array:
     small = 1 / 6 - squared / 120 + squared**2 / 5040
     third = np.where(angle < 0.1, small, (angle - np.sin(angle)) / np.maximum(angle, 0.1) ** 3)
     across = np.cross(vector, slope)
-    rates: Array = slope - half * across + third * np.cross(vector, across)
-    return rates
+    return slope - half * across + third * np.cross(vector, across)
