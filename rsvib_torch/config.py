@@ -3,18 +3,14 @@
 A file is checked without torch, whose import takes seconds, except for ``[simulation]``.
 """
 
-import functools
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
-from pydantic import Field
-
-from rsvib_torch import imaging, motion
-from rsvib_torch.checks.validation import Count, options, validate
+from rsvib_torch import imaging
+from rsvib_torch.checks.validation import options, validate
 from rsvib_torch.files.reading import Table, read_toml
 from rsvib_torch.motion.timing import SensorSection, SensorTiming
 from rsvib_torch.options import RestorationOptions, ToneOptions, WindowOptions
@@ -29,76 +25,21 @@ class Config:
     full_scale: float | None  # count that corresponds to 1.0 in integer frames; None if it is not in the file
     detection: Table  # options of ``detect_vibration`` that are in the file
     restoration: Table  # options of ``restore`` that are in the file
-    simulation: Any  # ``[simulation]``, of the class ``simulation_section``; None if it is not in the file
+    simulation: "imaging.SimulationSection | None"  # ``[simulation]``, if it is in the file
     stack: Table  # options ``window``, ``follow`` and ``bad_frames`` of ``process_stack`` that are in the file
     # options of the program that describe the camera, for the commands that it suggests
     arguments: tuple[str, ...] = ()
     path: Path | None = None  # the file; None if the camera is described by options only
 
 
-@functools.cache
-def simulation_section() -> Any:
-    """Class of ``[simulation]``; it needs torch, which takes seconds to import."""
-    tones = list[float] | list[list[float]]
-    axes = Field(default_factory=lambda: [0.0, 0.0])
-
-    @options
-    class CameraSection:
-        focal_length: float
-        principal_point: list[float] = Field(default_factory=lambda: [0.0] * 2, min_length=2, max_length=2)
-        distortion: list[float] = Field(default_factory=lambda: [0.0] * 5, min_length=4, max_length=5)
-        fisheye: bool = False
-
-        def __post_init__(self) -> None:
-            self.to_camera()  # which checks the values
-
-        def to_camera(self) -> motion.Camera:
-            return motion.Camera(**vars(self))
-
-    @options
-    class VibrationSection:
-        """Fields of ``Vibration``, which checks their values; an axis is one number (one tone) or a list of tones."""
-
-        amplitude: tones
-        frequency: tones
-        phase: tones = axes
-        image_motion: list[float] = axes
-        image_acceleration: list[float] = axes
-        image_shift: list[float] = axes
-        camera: CameraSection | None = None
-
-        def __post_init__(self) -> None:
-            try:
-                self.to_vibration()
-            except TypeError as error:  # lists of different lengths; pydantic reports ``ValueError`` only
-                raise ValueError(str(error)) from error
-
-        def to_vibration(self) -> motion.Vibration:
-            camera = None if self.camera is None else self.camera.to_camera()
-            return motion.Vibration(**{**vars(self), "camera": camera})
-
-    @options
-    class SimulationSection:
-        vibration: VibrationSection
-        num_frames: Count = 2
-        """Number of frames."""
-        frame_size: tuple[Count, Count] | None = Field(default=None, strict=False)
-        """(height, width) of the frames in px; None for the largest size that the scene allows."""
-        noise: imaging.SensorNoise | None = None
-        seed: int = Field(default=0, ge=0, le=2**63 - 1)
-        """Seed of the noise."""
-
-    return SimulationSection
-
-
 @options
 class ConfigFile:
-    """All tables of a file; the keys of ``[simulation]`` are those of ``simulation_section``."""
+    """All tables of a file; those of ``[simulation]`` are checked by ``SimulationSection``, which needs torch."""
 
     sensor: SensorSection
     detection: ToneOptions | None = None
     restoration: RestorationOptions | None = None
-    simulation: Any = None
+    simulation: Table | None = None
     stack: WindowOptions | None = None
 
 
@@ -147,9 +88,9 @@ def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, obj
             stated = {name: value for name, value in stated.items() if name not in replaced}
             data["sensor"] = {**stated, **sensor}
     content = validate(ConfigFile, data, source)
-    simulation = content.simulation
-    if simulation is not None:
-        simulation = validate(simulation_section(), simulation, source, "simulation")
+    simulation = None
+    if content.simulation is not None:
+        simulation = validate(imaging.SimulationSection, content.simulation, source, "simulation")
     return Config(
         source=source,
         timing=content.sensor.to_timing(),

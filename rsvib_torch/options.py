@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     Mask = ArrayLike | None
     Curve = tuple[ArrayLike | Sequence[float], ArrayLike | Sequence[float]]
 else:  # arrays are checked where they are used
-    Mask = Any
+    Mask = object
     Curve = list[list[float]]
 
 FilePath = str | os.PathLike[str] | None
@@ -446,7 +446,7 @@ class ProcessStackOptions(RunOptions, WindowOptions, StackOptions):
 
     given: Detections = None
     """Detections to use instead, one for each window (see ``read_manifest``)."""
-    motion: Any = None
+    motion: object = None
     """A ``FreeMotion`` of all frames to use instead of detections, such as a recorded one (``align_motion``): in image
     axes, with the exposure start of the first row of frame 0 as time origin. Frames are restored to its place 0."""
     scheduler: str | None = None

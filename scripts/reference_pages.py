@@ -20,7 +20,6 @@ import rsvib_torch as rsv
 from rsvib_torch.checks.validation import fields_of
 from rsvib_torch.checks.values import members_of
 from rsvib_torch.commands.main import app
-from rsvib_torch.config import simulation_section
 from rsvib_torch.motion.timing import SensorSection
 from rsvib_torch.options import METHOD_OPTIONS, OpticsOptions, RestorationOptions, ToneOptions, WindowOptions
 from rsvib_torch.results.reason import GROUPS
@@ -111,7 +110,7 @@ def key_table(group: Any, keys: Iterable[str] = (), meaning: Mapping[str, str] |
 
 def configuration_page() -> str:
     """Markdown of the reference of the configuration file."""
-    simulation = simulation_section()
+    simulation = rsv.imaging.SimulationSection
     plain = [key for key in fields_of(simulation) if key not in ("vibration", "noise")]
     vibration = fields_of(simulation)["vibration"].annotation
     lines = [CONFIGURATION, "## [sensor]", "", SENSOR, ""]

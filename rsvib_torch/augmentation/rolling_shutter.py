@@ -6,7 +6,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md), with
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import torch
 from kornia.augmentation import GeometricAugmentationBase2D
@@ -246,7 +246,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
             self.flags[name] = ranges + ranges[:1] * len(turns)
         self.flags["interpolation"] = interpolation
 
-    def forward(self, input: Tensor, params: Parameters | None = None, **kwargs: Any) -> Tensor:
+    def forward(self, input: Tensor, params: Parameters | None = None, **kwargs: object) -> Tensor:
         """Record images (H, W), (C, H, W) or (B, C, H, W); the other arguments are those of Kornia's augmentations."""
         if not torch.compiler.is_compiling():
             check_tensor("input", input)
@@ -283,7 +283,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         step = self._recording_length(params)
         return Vibration(**{name: value[::step] for name, value in drawn.items()}, camera=None)
 
-    def compute_transformation(self, input: Tensor, *_: Any, **__: Any) -> Tensor:
+    def compute_transformation(self, input: Tensor, *_: object, **__: object) -> Tensor:
         """Return identities (B, 3, 3): no matrix describes rows that move by different amounts."""
         return self.identity_matrix(input)
 
@@ -300,20 +300,20 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         moved = self._motion(params, images).move_images(images, flags["interpolation"])
         return frames_from_row_order(moved, self.timing)
 
-    def apply_transform_mask(self, input: Tensor, params: Parameters, *_: Any, **__: Any) -> Tensor:
+    def apply_transform_mask(self, input: Tensor, params: Parameters, *_: object, **__: object) -> Tensor:
         """Move masks (B, C, H, W) to the nearest pixel."""
         if input.numel() == 0:
             return input
         masks = frames_to_row_order(input, self.timing)
         return frames_from_row_order(self._motion(params, masks).move_masks(masks), self.timing)
 
-    def apply_transform_keypoint(self, input: Keypoints, params: Parameters, *_: Any, **__: Any) -> Keypoints:
+    def apply_transform_keypoint(self, input: Keypoints, params: Parameters, *_: object, **__: object) -> Keypoints:
         """Move keypoints to their positions in the frame."""
         output = input.clone()
         output._data = self._moved(input.data, params, (2,), ImageMotion.move)
         return output
 
-    def apply_transform_box(self, input: Boxes, params: Parameters, *_: Any, **__: Any) -> Boxes:
+    def apply_transform_box(self, input: Boxes, params: Parameters, *_: object, **__: object) -> Boxes:
         """Return the smallest upright boxes around the moved content of the boxes."""
         output = input.clone()
         output._data = self._moved(input.data, params, (4, 2), ImageMotion.move_boxes)
@@ -365,7 +365,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         height, width = (int(size) for size in params["forward_input_shape"].tolist()[-2:])
         return (height, width) if self.timing.scan_axis == -2 else (width, height)
 
-    def inverse_transform(self, *args: Any, **kwargs: Any) -> NoReturn:
+    def inverse_transform(self, *args: object, **kwargs: object) -> NoReturn:
         """Raise an error: the blur is inverted by restoration only."""
         remedy = "restore(frames, timing, vibration) removes a known vibration"
         raise NotImplementedError(f"RollingShutterVibration has no inverse; {remedy}")

@@ -10,7 +10,6 @@ import operator
 import os
 import types
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
 from functools import cache, reduce, wraps
 from typing import Annotated, Any, ParamSpec, Self, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -62,14 +61,14 @@ def as_numbers(name: str, value: object, device: torch.device | None = None) -> 
         raise TypeError(f"{name} must be {expected}, got {described(value)}") from error
 
 
-def check_shapes(values: Mapping[str, Any], shapes: Mapping[str, str]) -> None:
+def check_shapes(values: Mapping[str, object], shapes: Mapping[str, str]) -> None:
     """Raise a ``ValueError`` unless tensors have the stated shapes.
 
     Stated are the axes: a size; a name for a size that is the same in all tensors, at least 1, and 2 to 4 for ``A``,
     the components of a motion; ``...`` for leading dimensions that are the same in all tensors, or ``[...]`` for these
     or none. ``...`` alone, for values that are not tensors, is not checked; None is omitted.
     """
-    known: dict[str, Any] = {}
+    known: dict[str, object] = {}
 
     def fits(axis: str, size: int) -> bool:
         if axis.isdecimal():
@@ -81,11 +80,12 @@ def check_shapes(values: Mapping[str, Any], shapes: Mapping[str, str]) -> None:
         if value is None or stated == "...":
             continue
         lead, *axes = stated.split() if stated.startswith(("...", "[...]")) else ["", *stated.split()]
-        shape = tuple(value.shape)
+        shape = tuple(getattr(value, "shape", ()))
         count = len(shape) - len(axes)
         batch, sizes = shape[: max(count, 0)], shape[max(count, 0) :]
-        batches = {"": [()], "...": [known.get("...", batch)], "[...]": [known.get("...", batch), ()]}[lead]
-        if count < 0 or batch not in batches or not all(map(fits, axes, sizes)):
+        leading = known.get("...", batch)
+        batches: dict[str, tuple[object, ...]] = {"": ((),), "...": (leading,), "[...]": (leading, ())}
+        if count < 0 or batch not in batches[lead] or not all(map(fits, axes, sizes)):
             names = [lead.strip("[]")] * bool(lead) + axes
             limits = {"A": "2 to 4"} | known
             where = ", ".join(f"{axis} = {limits[axis]}" for axis in names if axis in limits)
@@ -179,8 +179,7 @@ def checked_methods(kind: type[R]) -> type[R]:
 def check_fields(value: Any) -> None:
     """Check the fields of a dataclass against their annotations; lists become tuples, tensors are copied."""
     kinds = hints_of(value.__class__)
-    for name in (field.name for field in fields(value)):
-        given = getattr(value, name)
+    for name, given in tuple(vars(value).items()):
         made = _checked(name, given, kinds[name], finite=False)
         made = made.clone() if isinstance(made, Tensor) else made
         if isinstance(made, (tuple, Tensor)) and not isinstance(given, tuple):
@@ -188,7 +187,7 @@ def check_fields(value: Any) -> None:
 
 
 @cache
-def hints_of(owner: Any) -> dict[str, object]:
+def hints_of(owner: Callable[..., object]) -> dict[str, object]:
     """Annotations of the arguments of a function, or of the fields of a class."""
     given = {name: kind for name, kind in owner.__annotations__.items() if name != "return"}
     if isinstance(owner, type):
@@ -198,7 +197,7 @@ def hints_of(owner: Any) -> dict[str, object]:
     return get_type_hints(types.SimpleNamespace(__annotations__=given), names, known, include_extras=True)
 
 
-def _checked(name: str, value: object, kind: object, *, finite: bool = True) -> Any:
+def _checked(name: str, value: object, kind: object, *, finite: bool = True) -> object:
     """The value, or a tuple in place of a list or array, if it is of a kind."""
     adapter, members = _adapter(kind, finite)
     if torch.device in members and value is not None:
@@ -213,7 +212,7 @@ def _checked(name: str, value: object, kind: object, *, finite: bool = True) -> 
 
 
 @cache
-def _adapter(kind: object, finite: bool) -> tuple[TypeAdapter[Any] | None, tuple[Any, ...]]:
+def _adapter(kind: object, finite: bool) -> tuple[TypeAdapter[object] | None, tuple[object, ...]]:
     """The check of an annotation, None where the function converts the value itself; and the members of a union."""
     members = members_of(kind)
     made_by_function = any(np.ndarray in (member, get_origin(member)) for member in members) and len(members) > 1
@@ -230,14 +229,14 @@ def _bounded(kind: Any, finite: bool) -> Any:  # noqa: PLR0911
     if kind is int:
         return Annotated[int, Field(ge=-(2**63), le=2**63 - 1)]
     if kind in (Any, Self) or isinstance(kind, TypeVar) or getattr(kind, "_is_protocol", False):
-        return Any
+        return object
     if get_origin(kind) in (os.PathLike, np.ndarray) or (
         isinstance(kind, type) and kind not in _PLAIN and get_origin(kind) is None
     ):
         made_by = f"{kind.__name__} ({kind._MADE_BY})" if hasattr(kind, "_MADE_BY") else None
         of_class = core_schema.is_instance_schema(get_origin(kind) or kind, cls_repr=made_by)
-        return Annotated[Any, GetPydanticSchema(lambda source, handler: of_class)]
-    arguments: Any = tuple(argument if argument is ... else _bounded(argument, finite) for argument in get_args(kind))
+        return Annotated[object, GetPydanticSchema(lambda source, handler: of_class)]
+    arguments = tuple(argument if argument is ... else _bounded(argument, finite) for argument in get_args(kind))
     if get_origin(kind) is tuple:
         return Annotated[tuple.__class_getitem__(arguments), Strict(False)]
     if get_origin(kind) in (Union, types.UnionType):

@@ -2,17 +2,16 @@
 
 import os
 from collections.abc import Iterator, Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import check_tensor
 from rsvib_torch.checks.values import check_choice
 
-ArrayLike = Tensor | NDArray[Any]
+ArrayLike = Tensor | np.ndarray
 FramesLike = ArrayLike | Sequence[ArrayLike]
 PathLike = str | os.PathLike[str]
 FramesOrFiles = FramesLike | PathLike | Sequence[PathLike]

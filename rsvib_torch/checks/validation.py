@@ -95,12 +95,12 @@ def _describe(group: type) -> None:
         field.description = " ".join((described_by.description or "").split())
 
 
-def fields_of(group: type) -> Table:
+def fields_of(group: object) -> Table:
     """Fields of a group of options, by name: annotation, default and description."""
     return dict(vars(group)["__pydantic_fields__"])
 
 
-def flat_options(group: Any, function: Callable[..., object]) -> Any:
+def flat_options(group: Callable[..., object], function: Callable[..., _Result]) -> Callable[..., _Result]:
     """The function with the fields of a group of options as keyword arguments, instead of its argument ``options``.
 
     Its signature and its docstring list them; the line ``options:`` of the docstring is replaced.
@@ -109,7 +109,7 @@ def flat_options(group: Any, function: Callable[..., object]) -> Any:
     names = {parameter.name for parameter in direct}
 
     @wraps(function)
-    def flat(*args: object, **given: object) -> object:
+    def flat(*args: object, **given: object) -> _Result:
         stated = {name: given.pop(name) for name in names & given.keys()}
         return function(*args, **stated, options=group(**given))
 
@@ -128,7 +128,7 @@ def flat_options(group: Any, function: Callable[..., object]) -> Any:
     return flat
 
 
-def _with_options(text: str, group: type) -> str:
+def _with_options(text: str, group: object) -> str:
     """A docstring in which the line ``options:`` is replaced by the options of a group; without text, only these."""
     entries = (f"{name}: {field.description}" for name, field in fields_of(group).items())
     listed = [fill(entry, 116, initial_indent=" " * 4, subsequent_indent=" " * 8) for entry in entries]

@@ -11,6 +11,7 @@ from importlib import import_module
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from rsvib_torch.text import quoted
@@ -52,10 +53,10 @@ def refused(kind: type[Error], name: str, problem: str) -> Error:
     return error
 
 
-def check_single(name: str, value: Any) -> None:
+def check_single(name: str, batch_shape: Sequence[int]) -> None:
     """Raise a ``ValueError`` if a result or a motion is a batch."""
-    if value.batch_shape:
-        raise ValueError(f"{name} is a batch of shape {tuple(value.batch_shape)}: pass one of them, {name}[0]")
+    if batch_shape:
+        raise ValueError(f"{name} is a batch of shape {tuple(batch_shape)}: pass one of them, {name}[0]")
 
 
 def check_number(
@@ -146,15 +147,15 @@ def _explained(path: str, keys: Sequence[str | int], entries: list[ErrorDetails]
 
 def _options_at(group: object, keys: Sequence[str | int]) -> list[str]:
     """Names of the options of a group that is a value in a group; none of other values."""
-    fields: Mapping[Any, Any] = {}
+    fields: Mapping[str | int, FieldInfo] = {}
     for key in ("", *keys):
         group = fields[key].annotation if key in fields else group
         kind = next((one for one in members_of(group) if hasattr(one, "__pydantic_fields__")), None)
         fields = getattr(kind, "__pydantic_fields__", {})
-    return list(fields)
+    return list(map(str, fields))
 
 
-def members_of(annotation: object) -> tuple[Any, ...]:
+def members_of(annotation: object) -> tuple[object, ...]:
     """Members of a union without their bounds, and without None."""
     annotation = without_alias(annotation)
     if get_origin(annotation) is Annotated:

@@ -80,11 +80,11 @@ def _parameter(name: str, annotation: object, default: object, form: Table) -> i
     option_name = f"--{name.replace('_', '-')}"
     switch = [f"{option_name}/--no-{option_name[2:]}" if automatic else option_name]
     names = form.pop("names", ()) or (switch if kind is bool else [])
-    make: Any = typer.Argument if form.pop("positional", False) else typer.Option
+    make: Callable[..., object] = typer.Argument if form.pop("positional", False) else typer.Option
     info = make(*names, help=form.pop("text"), **{"show_default": True} | form)
     default = False if default is None and kind is bool and not automatic else default
-    stated: Any = Annotated[kind | None if default is None else kind, info]
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=stated)
+    kind = Annotated[kind | None if default is None else kind, info]
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
 
 
 def _parameters(group: type) -> Iterator[tuple[str, inspect.Parameter]]:

@@ -153,17 +153,14 @@ def known(given: KnownOptions) -> Answer:
         elif given.unit is None and given.focal_length is not None:
             camera = rsvib_torch.Camera(given.focal_length)
         with working("aligning the recording"):
-            found = stacks.align_stack(
-                given.stack,
-                info,
-                timing,
-                recorded,
+            chosen = gyroscope.AlignOptions(
                 camera=camera,
                 offsets=given.offsets,
                 ignore=ignore,
                 fit_gain=given.fit_gain,
                 fit_row_time=given.fit_row_time,
             )
+            found = stacks.align_stack(given.stack, info, timing, recorded, chosen)
         results["Recording on the clock of the frames"] = [found.summary()]
         data["alignment"] = _without_curves(found)
         _refuse(given, found.reasons)

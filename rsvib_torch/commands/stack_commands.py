@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 
@@ -20,7 +20,7 @@ from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.terminal import Answer, current_output, note, working
 from rsvib_torch.files.atomic import check_writable, whole_folder
 from rsvib_torch.files.reading import Table, check_regular
-from rsvib_torch.options import DetectStackOptions
+from rsvib_torch.options import DetectStackOptions, RestorationOptions
 from rsvib_torch.text import printable
 
 if TYPE_CHECKING:
@@ -310,7 +310,8 @@ def report(given: ReportOptions) -> Answer:
     pixels, timing = load(given, options)
     detection = _detect(pixels, timing, settings)
     with working("restoring and judging"):
-        result = stacks.restore_trusted(pixels, timing, detection, options, force=given.force, most_pairs=8)
+        chosen = RestorationOptions(**options)
+        result = stacks.restore_trusted(pixels, timing, detection, chosen, force=given.force, most_pairs=8)
     answers.warn_of_restoration(result, "page")
     pattern = options.get("mosaic")
     steps = []
@@ -326,10 +327,8 @@ def report(given: ReportOptions) -> Answer:
         answer.results[title] = answer.results.pop("Restoration")
         answer.results[f"Restoration according to {given.manifest}"] = windows.lines()[1]
     answer.next_steps += steps
-    return _write_page(
-        given,
-        windows,
-        answer,
+    page = reports.Report(
+        **_page_head(given, windows),
         frames=pixels if pattern is None else preparation.colour_frames(pixels, pattern),
         restored=result.frames,
         was_restored=result.restored,
@@ -340,6 +339,7 @@ def report(given: ReportOptions) -> Answer:
         options=options,
         next_steps=tuple(steps),
     )
+    return _write_page(given, page, answer)
 
 
 def _report_of_run(given: ReportOptions, windows: stacks.StackManifest, made: Path) -> Answer:
@@ -351,29 +351,31 @@ def _report_of_run(given: ReportOptions, windows: stacks.StackManifest, made: Pa
     before, after = (torch.stack([read_frame(path, first + n, full) for n in (0, 1)]) for path, full in of_both)
     answer = answers.windows_answer(f"Vibration in {given.stack.name}", windows)
     answer.results[f"Restoration according to {given.manifest}"] = windows.lines()[1]
-    return _write_page(
-        given,
-        windows,
-        answer,
+    page = reports.Report(
+        **_page_head(given, windows),
         frames=before if windows.margins is None else video.Margins(**windows.margins).cut(before),
         restored=after,
         was_restored=True,
         timing=given.settings.timing,
         first=first,
     )
+    return _write_page(given, page, answer)
 
 
-def _write_page(given: ReportOptions, windows: stacks.StackManifest | None, answer: Answer, **content: Any) -> Answer:
-    """Write the page of this content, and add its files to the answer."""
+def _page_head(given: ReportOptions, windows: stacks.StackManifest | None) -> Table:
+    """Content of a page apart from the frames."""
+    return {
+        "title": printable(f"Vibration in {given.stack.name}"),
+        "subtitle": printable(f"{given.stack}, camera of {given.settings.source}"),
+        "version": rsvib_torch.__version__,
+        "command": current_output().command,
+        "windows": windows,
+    }
+
+
+def _write_page(given: ReportOptions, page: reports.Report, answer: Answer) -> Answer:
+    """Write a page, and add its files to the answer."""
     inputs = [*given.inputs, *([] if given.manifest is None else [given.manifest])]
-    page = reports.Report(
-        title=printable(f"Vibration in {given.stack.name}"),
-        subtitle=printable(f"{given.stack}, camera of {given.settings.source}"),
-        version=rsvib_torch.__version__,
-        command=current_output().command,
-        windows=windows,
-        **content,
-    )
     with whole_folder(given.out) as folder, working("writing the page"):
         files = reports.write_report_page(folder, page, list(map(_edge_box, given.edge or ())) or None)
         shared.check_new([given.out / name for name in files], overwrite=True, inputs=inputs)

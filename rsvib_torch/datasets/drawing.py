@@ -6,15 +6,17 @@ sums of such edges and exact; curved edges are nearly so.
 
 import math
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from pydantic import Field
 from torch import Tensor
 
+from rsvib_torch.files.reading import Table
+
 Size = Annotated[int, Field(ge=64)]  # rows or columns of a scene
 Blur = Annotated[float, Field(ge=0.4)]  # px; a narrower blur cannot be sampled
-FLOAT: Any = {"dtype": torch.float32, "device": "cpu"}  # drawn scenes do not depend on defaults of PyTorch
+FLOAT: Table = {"dtype": torch.float32, "device": "cpu"}  # drawn scenes do not depend on defaults of PyTorch
 
 
 def edge(distance: Tensor, sigma: float) -> Tensor:

@@ -122,5 +122,4 @@ class VibrationDetector(TimedModule):
 
     def forward(self, frames: FramesOrFiles) -> DetectionResult:
         """Detect the vibration in a stack of frames."""
-        result: DetectionResult = detect_vibration(frames, self.timing, **vars(self.options))
-        return result
+        return detect_vibration(frames, self.timing, **vars(self.options))

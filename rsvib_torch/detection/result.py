@@ -3,17 +3,19 @@
 import math
 import os
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from rsvib_torch.detection.spectrum import DisplacementSpectrum, displacement_spectrum
+from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.results.presentation import Result, axis_head, axis_rows, plain_values
+from rsvib_torch.results.reason import Findings
 from rsvib_torch.text import measured_text, text_table
 
 if TYPE_CHECKING:
@@ -191,7 +193,7 @@ class DetectionResult(
         """Draw ``spectrum``; ``path`` as in ``plot``."""
         return self.spectrum().plot(path)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Table:
         """All values as nested lists, numbers and texts, as in a ``vibration.json``; None for unknown numbers."""
         values = super().to_dict()
         values["period"] = plain_values(self.vibration.period)
@@ -211,7 +213,7 @@ class DetectionResult(
             """The first axes of values (..., A), or (..., A, K) of tones."""
             return values[..., :count, :] if values.ndim == batch + 2 else values[..., :count]
 
-        def of_findings(findings: tuple[Any, ...], depth: int) -> tuple[Any, ...]:
+        def of_findings(findings: Findings, depth: int) -> Findings:
             return findings[:count] if depth == 0 else tuple(of_findings(part, depth - 1) for part in findings)
 
         curve, hidden = self.offsets, self.std_if_hidden_tone

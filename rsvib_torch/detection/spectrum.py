@@ -128,7 +128,7 @@ def displacement_spectrum(
     curve: OffsetCurve, timing: SensorTiming, vibration: Vibration, fitted: Tensor
 ) -> DisplacementSpectrum:
     """The spectrum of the displacement from offsets of one stack, ``fitted`` (P, N, A) by a known vibration."""
-    check_single("result", curve)
+    check_single("result", curve.batch_shape)
     good = curve.good & (curve.quality > 0)
     if curve.std is not None:
         good &= (torch.isfinite(curve.std) & (curve.std > 0)).all(-1)

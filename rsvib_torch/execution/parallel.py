@@ -8,17 +8,17 @@ from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from functools import cache
 from importlib import import_module
-from itertools import repeat, takewhile
+from itertools import chain, islice, takewhile
 from threading import Lock
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
+Given = TypeVar("Given")
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-_END: Any = object()
 
 # px of a frame. Threads of one operation wait for each other at its end, and operations on a frame of 512 x 512 px take
 # 0.1 ms. On two idle cores, a second thread saves a tenth of the time of a detection in a pair of 512 x 512 px. Beside
@@ -126,8 +126,8 @@ def in_parallel(
 
 
 def in_order(
-    items: Iterable[Any],
-    submit: Callable[[Any], Item],
+    items: Iterable[Given],
+    submit: Callable[[Given], Item],
     capacity: Callable[[], int],
     result: Callable[[Item], Result],
     waiting: deque[Item],
@@ -143,7 +143,7 @@ def in_order(
 
 
 @contextmanager
-def _pool(count: int, threads: int, items: Generator[Any, None, None]) -> Iterator[ThreadPoolExecutor]:
+def _pool(count: int, threads: int, items: Generator[object, None, None]) -> Iterator[ThreadPoolExecutor]:
     """Threads that use ``threads`` of PyTorch each; they end with the block, and then the source of items is closed."""
     before = torch.get_num_threads()
     pool = ThreadPoolExecutor(count, "rsvib", initializer=torch.set_num_threads, initargs=(threads,))
@@ -162,12 +162,14 @@ def prefetched(items: Generator[Item, None, None], count: int, threads: int = 1)
     are raised behind the items before them.
     """
     with _pool(1, threads, items) as pool:
-        made = in_order(repeat(0), lambda _: pool.submit(next, items, _END), lambda: count + 1, Future.result, deque())
-        yield from takewhile(lambda item: item is not _END, made)
+        ones = iter(lambda: islice(items, 1), None)  # parts of one item; of none behind the last
+        ahead: deque[Future[list[Item]]] = deque()
+        made = in_order(ones, lambda one: pool.submit(list, one), lambda: count + 1, Future.result, ahead)
+        yield from chain.from_iterable(takewhile(bool, made))
 
 
 def in_threads(
-    work: Callable[..., Result], items: Generator[tuple[Any, ...], None, None], *, at_once: int, threads: int = 1
+    work: Callable[..., Result], items: Generator[tuple[object, ...], None, None], *, at_once: int, threads: int = 1
 ) -> Generator[Result, None, None]:
     """Results of ``work(*item)`` in order, from ``at_once`` threads with ``threads`` of PyTorch each."""
     with _pool(at_once, threads, items) as pool:

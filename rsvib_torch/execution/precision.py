@@ -5,7 +5,8 @@ from contextlib import contextmanager
 from copy import copy
 from dataclasses import is_dataclass
 from functools import wraps
-from typing import Any, ParamSpec, TypeVar, cast
+from types import ModuleType
+from typing import ParamSpec, TypeVar, cast
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-_BACKENDS: Any = torch.backends  # their attributes are not typed
+_BACKENDS: ModuleType = torch.backends  # whose attributes are not typed
 
 
 @contextmanager
@@ -90,7 +91,7 @@ def without_gradients(function: Callable[P, R]) -> Callable[P, R]:
 
 def outside_inference(value: R) -> R:
     """Copies of the tensors of inference mode in a tensor, sequence, mapping or dataclass; the rest is kept."""
-    result: Any = value
+    result: object = value
     if isinstance(value, Tensor):
         result = value.clone() if value.is_inference() else value
     elif isinstance(value, (tuple, list)):

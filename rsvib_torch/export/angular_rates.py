@@ -79,7 +79,7 @@ def write_gcsv(
         >>> lines[lines.index("t,gx,gy,gz") + 1]  # 1e-9 rad/s: pitch rate 2 pi 80 / 1000, yaw rate -2 pi 50 2 / 1000
         '0,502654825,-628318531,0'
     """
-    check_single("motion", motion)
+    check_single("motion", motion.batch_shape)
     rows = int(size[int(timing.scan_axis)])
     timing.check_rows(rows)
     if motion.camera is None:
@@ -141,5 +141,4 @@ def _body_rates(vector: Array, slope: Array) -> Array:
     small = 1 / 6 - squared / 120 + squared**2 / 5040
     third = np.where(angle < 0.1, small, (angle - np.sin(angle)) / np.maximum(angle, 0.1) ** 3)
     across = np.cross(vector, slope)
-    rates: Array = slope - half * across + third * np.cross(vector, across)
-    return rates
+    return slope - half * across + third * np.cross(vector, across)

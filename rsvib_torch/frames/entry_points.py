@@ -104,7 +104,7 @@ def module_options(
 class TimedModule(nn.Module):
     """A module with a fixed timing and fixed options of its function, which its representation states."""
 
-    def __init__(self, timing: SensorTiming, options: Any) -> None:
+    def __init__(self, timing: SensorTiming, options: object) -> None:
         super().__init__()
         check_timing(timing)
         self.timing, self.options = timing, options
@@ -121,11 +121,11 @@ class TimedModule(nn.Module):
         return ", ".join(stated)
 
 
-def entry_point(options: Any, function: Callable[..., Any]) -> Any:
+def entry_point(options: Callable[..., object], function: Callable[..., object]) -> Callable[..., Any]:
     """A function with flat options, outside of compiled graphs; arguments as of ``flat_options``."""
 
     @wraps(function)
-    def solved(*args: Any, **kwargs: Any) -> Any:
+    def solved(*args: object, **kwargs: object) -> object:
         try:
             return function(*args, **kwargs)
         except (np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]

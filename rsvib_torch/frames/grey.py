@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -30,10 +29,10 @@ class GreyFrames:
     # the sensor in image orientation, with the frame times of the file if frames were given by a path
     timing: SensorTiming
 
-    def _changed(self, change: Callable[[Tensor], Tensor], **stated: Any) -> "GreyFrames":
-        """The stacks with a change of images and mask, and other values of further fields."""
+    def _changed(self, change: Callable[[Tensor], Tensor]) -> "GreyFrames":
+        """The stacks with a change of images and mask."""
         valid = None if self.valid is None else _unless_complete(change(self.valid))
-        return replace(self, images=change(self.images), valid=valid, **stated)
+        return replace(self, images=change(self.images), valid=valid)
 
     def narrowed(self, columns: int) -> "GreyFrames":
         """The given number of neighbouring columns of each stack, those with the most detail."""
@@ -48,13 +47,12 @@ class GreyFrames:
 
     def one(self, index: int) -> "GreyFrames":
         """One stack out of the batch, as a batch of one."""
-        return self._changed(lambda values: values[index : index + 1], batched=False)
+        return replace(self._changed(lambda values: values[index : index + 1]), batched=False)
 
     def with_timing(self, timing: SensorTiming) -> "GreyFrames":
         """The same stacks in the row order of another timing."""
-        return self._changed(
-            lambda values: frames_to_row_order(frames_from_row_order(values, self.timing), timing), timing=timing
-        )
+        turned = self._changed(lambda values: frames_to_row_order(frames_from_row_order(values, self.timing), timing))
+        return replace(turned, timing=timing)
 
 
 def _unless_complete(valid: Tensor) -> Tensor | None:

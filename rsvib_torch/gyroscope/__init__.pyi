@@ -2,9 +2,10 @@ from .alignment import ClockAlignment, MotionCheck, align_motion, check_motion
 from .gpmf_track import CameraTrack, read_camera_track
 from .gyroscope_rates import AngularRates
 from .read_gyroscope import read_gyroscope
-from .rotation_alignment import RotationAlignment
+from .rotation_alignment import AlignOptions, RotationAlignment
 
 __all__ = [
+    "AlignOptions",
     "AngularRates",
     "CameraTrack",
     "ClockAlignment",

@@ -6,16 +6,13 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, ParamSpec, Protocol, overload
+from typing import ParamSpec, Protocol, overload
 
 import numpy as np
 import torch
-from pydantic import Field
 from torch import Tensor
 
 from rsvib_torch.checks.arrays import FramesOrFiles
-from rsvib_torch.checks.validation import Number
-from rsvib_torch.checks.validation import options as option_group
 from rsvib_torch.checks.values import check_single, described
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.grouped_frames import grouped_frames
@@ -33,8 +30,7 @@ from rsvib_torch.frames.orientation import (
 )
 from rsvib_torch.gyroscope.corner_tracks import corner_tracks
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
-from rsvib_torch.gyroscope.rotation_alignment import RotationAlignment, align_rates, offset_range, outside
-from rsvib_torch.motion.camera import Camera
+from rsvib_torch.gyroscope.rotation_alignment import AlignOptions, RotationAlignment, align_rates, offset_range, outside
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
@@ -120,31 +116,6 @@ class FittedClock:
         return FreeMotion(moved.coefficients + drift, moved.start, moved.spacing, moved.tones, moved.camera)
 
 
-@option_group
-class AlignOptions(OffsetOptions):
-    """Options of ``align_motion``; bands are those of the start, and not used for angular rates."""
-
-    camera: Camera | None = Field(
-        default=None, description="Focal length and lens, for angular rates; by default the focal length is fitted."
-    )
-    offsets: tuple[Number, Number] | None = Field(
-        default=None,
-        strict=False,
-        description="Smallest and largest offset in seconds; by default all for which the recording covers the frames. "
-        "A result outside them is refused.",
-    )
-    fit_scale: bool = Field(default=True, description="Whether to fit the ratio of the speeds of the clocks.")
-    fit_gain: bool = Field(
-        default=False,
-        description="Whether to fit a factor of the recorded motion of each axis; with angular rates, the focal length "
-        "of the camera.",
-    )
-    fit_row_time: bool = Field(
-        default=False,
-        description="Whether to fit the row time as well, with angular rates; ``timing`` has the start value.",
-    )
-
-
 class _AlignsMotion(Protocol[P]):
     """Type of ``align_motion``."""
 
@@ -158,7 +129,7 @@ class _AlignsMotion(Protocol[P]):
     ) -> RotationAlignment: ...
 
 
-def _align_options(options: Callable[P, AlignOptions]) -> Callable[[Callable[..., Any]], _AlignsMotion[P]]:
+def _align_options(options: Callable[P, AlignOptions]) -> Callable[[Callable[..., object]], _AlignsMotion[P]]:
     return lambda function: entry_point(options, function)
 
 
@@ -215,7 +186,7 @@ def align_motion(
             f"got {type(recorded).__name__}"
         )
     if isinstance(recorded, FreeMotion):
-        check_single("recorded", recorded)
+        check_single("recorded", recorded.batch_shape)
     if isinstance(recorded, FreeMotion) and (options.camera is not None or options.fit_row_time):
         raise ValueError("camera and fit_row_time are for angular rates (read_gyroscope); omit them for a FreeMotion")
     stack = grey_frames(frames, timing, options)
@@ -227,16 +198,8 @@ def align_motion(
         images = frames_from_row_order(grey[0], timing)
         masks = [None] * len(images) if stack.valid is None else frames_from_row_order(stack.valid[0], timing)
         starts = timing.in_row_order().frame_starts(len(images)).tolist()
-        return align_rates(
-            corner_tracks(zip(range(len(images)), images, masks, strict=True), starts, timing),
-            timing,
-            recorded,
-            options.camera,
-            offsets=options.offsets,
-            fit_scale=options.fit_scale,
-            fit_gain=options.fit_gain,
-            fit_row_time=options.fit_row_time,
-        )
+        tracks = corner_tracks(zip(range(len(images)), images, masks, strict=True), starts, timing)
+        return align_rates(tracks, timing, recorded, options)
     rowwise, start = start_of_stack(stack, timing, options)
     measured, (first, last) = start.measurements, record_of(stack, rowwise)
     turned = recorded.to_row_order(timing).to("cpu")
@@ -428,7 +391,7 @@ def check_motion(frames: FramesOrFiles, timing: SensorTiming, motion: Motion, op
         raise TypeError(f"motion must be a Motion, got {described(motion)}")
     stack = grey_frames(frames, timing, options)
     timing = stack.timing
-    check_single("motion", motion)
+    check_single("motion", motion.batch_shape)
     if stack.batched:
         raise ValueError("check_motion takes one stack, not a batch")
     measured = start_of_stack(stack, timing, options)[1].measurements

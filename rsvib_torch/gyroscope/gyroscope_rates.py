@@ -3,7 +3,6 @@
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
@@ -114,7 +113,7 @@ class AngularRates(Result, units={"times": "s", "rates": "rad/s"}, shapes={"time
         """
         angle, area = self._integrals
         first, last = start.detach().cpu().numpy(), end.detach().cpu().numpy()
-        before: Any = angle(first)
+        before: Array = angle(first)
         turned = angle(last) - before
         vector = turned + 0.5 * (area(last) - area(first) - np.cross(before, turned))
         return torch.from_numpy(vector).to(start.device)

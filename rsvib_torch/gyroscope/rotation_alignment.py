@@ -4,8 +4,11 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
+from rsvib_torch.checks.validation import Number
+from rsvib_torch.checks.validation import options as option_group
 from rsvib_torch.checks.values import check_number
 from rsvib_torch.detection.verdict import recording_reasons
 from rsvib_torch.gyroscope.corner_tracks import CornerTracks
@@ -15,6 +18,7 @@ from rsvib_torch.gyroscope.rotation_search import Start, search_orientations
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.options import OffsetOptions
 from rsvib_torch.results.presentation import JudgedResult
 from rsvib_torch.results.reason import Reason
 from rsvib_torch.text import measured_text, text_table, wrapped
@@ -163,18 +167,36 @@ def outside(offset: float, std: float, limits: tuple[float, float] | None) -> li
     return [Reason("offset_outside", None, offset, limits[0] if offset < limits[0] else limits[1])]
 
 
+@option_group
+class AlignOptions(OffsetOptions):
+    """Options of ``align_motion``; bands are those of the start, and not used for angular rates."""
+
+    camera: Camera | None = Field(
+        default=None, description="Focal length and lens, for angular rates; by default the focal length is fitted."
+    )
+    offsets: tuple[Number, Number] | None = Field(
+        default=None,
+        strict=False,
+        description="Smallest and largest offset in seconds; by default all for which the recording covers the frames. "
+        "A result outside them is refused.",
+    )
+    fit_scale: bool = Field(default=True, description="Whether to fit the ratio of the speeds of the clocks.")
+    fit_gain: bool = Field(
+        default=False,
+        description="Whether to fit a factor of the recorded motion of each axis; with angular rates, the focal length "
+        "of the camera.",
+    )
+    fit_row_time: bool = Field(
+        default=False,
+        description="Whether to fit the row time as well, with angular rates; ``timing`` has the start value.",
+    )
+
+
 def align_rates(
-    tracks: CornerTracks,
-    timing: SensorTiming,
-    rates: AngularRates,
-    camera: Camera | None = None,
-    *,
-    offsets: tuple[float, float] | None = None,
-    fit_scale: bool = True,
-    fit_gain: bool = False,
-    fit_row_time: bool = False,
+    tracks: CornerTracks, timing: SensorTiming, rates: AngularRates, options: AlignOptions
 ) -> RotationAlignment:
     """``align_motion`` for angular rates, from the corners of pairs of frames."""
+    camera, offsets = options.camera, options.offsets
     if camera is not None:
         camera.check_size(tracks.size[1], tracks.size[0])
     rows = tracks.size[int(timing.scan_axis)]
@@ -182,9 +204,9 @@ def align_rates(
     last += rows * timing.row_time + timing.exposure_time
     limits = offset_range(rates.start, rates.end, begin, last, offsets)
     middle = 0.5 * (begin + last)
-    fit_focal_length = camera is None or fit_gain
+    fit_focal_length = camera is None or options.fit_gain
     known = None if fit_focal_length else camera
-    free = (True, True, True, True, fit_scale, fit_focal_length, fit_row_time)
+    free = (True, True, True, True, options.fit_scale, fit_focal_length, options.fit_row_time)
 
     def parameters(start: Start, row_time: float) -> Tensor:
         values = [0.0, 0.0, 0.0, start.offset + middle, 1.0, start.focal_length, row_time]

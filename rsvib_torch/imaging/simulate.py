@@ -91,7 +91,7 @@ def simulate_frames(
         raise TypeError(f"noise must be a SensorNoise, got {type(noise).__name__}")
     if num_frames < 1:
         raise ValueError(f"num_frames must be at least 1, got {num_frames}")
-    check_single("vibration", vibration)
+    check_single("vibration", vibration.batch_shape)
     height, width = map(min, frame_size or scene.shape[-2:], scene.shape[-2:])
     row_bytes = 400 * min(height, _CHUNK_ROWS) + 12 * height  # per column: spectra of a chunk, frames; measured
     if scene.device.type == "cpu":

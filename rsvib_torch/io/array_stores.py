@@ -9,12 +9,13 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from rsvib_torch.checks.values import needed_package
+from rsvib_torch.checks.values import Value, needed_package
 from rsvib_torch.files.reading import Table
 from rsvib_torch.io.blocks import BlockReader
 from rsvib_torch.io.full_scale import check_dtype
@@ -23,7 +24,11 @@ from rsvib_torch.io.stated_metadata import attributes_of, info_from_attributes, 
 from rsvib_torch.numerics.tables import Array
 
 if TYPE_CHECKING:
-    import h5py
+    from h5py import Dataset, File, Group
+    from zarr import Array as ZarrArray
+    from zarr.core.metadata import ArrayV3Metadata
+
+    Stored: TypeAlias = Dataset | ZarrArray[ArrayV3Metadata]
 
 _NAME = "frames"  # of the array that is written
 _MAX_MEMBERS = 10_000  # groups and datasets of HDF5; each takes about 0.1 ms
@@ -33,7 +38,7 @@ _CONCURRENT = 10  # chunks that zarr decodes at the same time (async.concurrency
 _BUFFERS = 3  # of a chunk while zarr decodes it, at most; measured with gzip, zstd needs 2
 
 
-def _only(arrays: Mapping[str, Any]) -> Any:
+def _only(arrays: Mapping[str, Value]) -> Value:
     """The only one of arrays by their names, or the one called ``frames``."""
     stacks = {_NAME: arrays[_NAME]} if _NAME in arrays else arrays
     if len(stacks) != 1:
@@ -42,18 +47,18 @@ def _only(arrays: Mapping[str, Any]) -> Any:
     return next(iter(stacks.values()))
 
 
-def _info(array: Any) -> StackInfo:
+def _info(array: Stored) -> StackInfo:
     check_dtype(array.dtype)
     return info_from_attributes(dict(array.attrs), tuple(int(size) for size in array.shape), array.dtype)
 
 
 def _reader(
-    path: Path, info: StackInfo, array: Any, more_bytes: int, close: Callable[[], None] = lambda: None
+    path: Path, info: StackInfo, array: Stored, more_bytes: int, close: Callable[[], None] = lambda: None
 ) -> BlockReader:
     """Reader of an array, (T, ...) or a single frame, with the frames of a chunk together."""
 
     def read(first: int, last: int) -> Array:
-        frames = np.asarray(array[first:last] if array.ndim > 2 else array[...][None])
+        frames = np.asarray(array[first:last]) if array.ndim > 2 else np.asarray(array[...])[None]
         return np.moveaxis(frames, -1, 1) if info.stored_axes == "THWC" else frames
 
     return BlockReader(path, info, read, array.chunks[0] if array.chunks and array.ndim > 2 else 1, more_bytes, close)
@@ -61,18 +66,16 @@ def _reader(
 
 # HDF5
 
-
-def _h5py() -> Any:
-    return needed_package("h5py", "reading and writing HDF5", "formats")
+_h5py = partial(needed_package, "h5py", "reading and writing HDF5", "formats")
 
 
-def _find_dataset(file: h5py.File) -> h5py.Dataset:
+def _find_dataset(file: File) -> Dataset:
     """The only dataset of frames, or the one called ``frames``; links and external data are not followed."""
     h5py = _h5py()
-    found: dict[str, Any] = {}
+    found: dict[str, Dataset] = {}
     members = itertools.count(1)
 
-    def visit(name: str, member: Any) -> None:
+    def visit(name: str, member: Group | Dataset) -> None:
         if next(members) > _MAX_MEMBERS:
             raise ValueError(f"it has more than {_MAX_MEMBERS} members; expected a file with one stack of frames")
         if isinstance(member, h5py.Dataset) and member.ndim in (2, 3, 4) and member.dtype.kind in "iuf":
@@ -88,12 +91,12 @@ def _find_dataset(file: h5py.File) -> h5py.Dataset:
     return dataset
 
 
-def _is_outside(dataset: h5py.Dataset) -> bool:
+def _is_outside(dataset: Dataset) -> bool:
     """Whether the values of a dataset lie in other files or datasets."""
     return bool(dataset.external or dataset.is_virtual)
 
 
-def _check_dataset(dataset: h5py.Dataset, file_size: int) -> int:
+def _check_dataset(dataset: Dataset, file_size: int) -> int:
     """Size of a chunk in bytes; a ``ValueError`` if the pixels cannot be in the file, before memory is allocated."""
     stored = dataset.id.get_storage_size()
     needed = int(np.prod(dataset.shape, dtype=object)) * dataset.dtype.itemsize
@@ -107,7 +110,7 @@ def _check_dataset(dataset: h5py.Dataset, file_size: int) -> int:
     return chunk
 
 
-def _times_beside(file: h5py.File, dataset: h5py.Dataset, count: int) -> Table:
+def _times_beside(file: File, dataset: Dataset, count: int) -> Table:
     """Times and frame rate in datasets beside the frames, or in attributes of their group or of the file."""
     h5py = _h5py()
     found: Table = {}
@@ -160,12 +163,10 @@ def write_hdf5(path: Path, info: StackInfo, frames: Iterator[Array], compression
 
 # Zarr
 
-
-def _zarr() -> Any:
-    return needed_package("zarr", "reading and writing Zarr", "formats")
+_zarr = partial(needed_package, "zarr", "reading and writing Zarr", "formats")
 
 
-def _check_sizes(array: Any, info: StackInfo, folder: Path) -> None:
+def _check_sizes(array: Stored, info: StackInfo, folder: Path) -> None:
     """Raise a ``ValueError`` if the pixels cannot be in the folder, before memory is allocated for them."""
     chunk = int(np.prod(array.shards or array.chunks, dtype=object)) * array.dtype.itemsize
     held = 0

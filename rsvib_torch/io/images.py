@@ -10,7 +10,6 @@ from contextlib import closing, suppress
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -39,8 +38,8 @@ def image_info(path: Path) -> StackInfo:
     with readable_stack(path, "PNG" if is_png else "JPEG"), path.open("rb") as file:
         head = file.read(_LONGEST_HEADER)  # Pillow would search a file of any size for it, at 20 MB/s
         file_size = file.seek(0, io.SEEK_END)
-        image: Any = PngImageFile(io.BytesIO(head)) if is_png else JpegImageFile(io.BytesIO(head))
-        if is_png and image.is_animated:
+        image = PngImageFile(io.BytesIO(head)) if is_png else JpegImageFile(io.BytesIO(head))
+        if isinstance(image, PngImageFile) and image.is_animated:
             raise ValueError("an animated PNG, of which only the first frame could be read; write its frames as files")
         if image.mode not in _CHANNELS:
             raise ValueError(f"pixels are {image.mode}; expected grey{', RGB or RGBA' if is_png else ' or RGB'}")

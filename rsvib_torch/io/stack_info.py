@@ -11,6 +11,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from rsvib_torch.checks.arguments import check_fields, checked_methods
+from rsvib_torch.files.reading import Table
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.results.presentation import Summarised
 from rsvib_torch.text import one_line
@@ -165,7 +166,7 @@ class StackInfo(Summarised):
         if count == self.shape[0]:
             return self
         shape = (count, *self.shape[1:])
-        unknown: dict[str, Any] = dict.fromkeys(("frame_times", "frame_numbers", "path", "files"))
+        unknown: Table = dict.fromkeys(("frame_times", "frame_numbers", "path", "files"))
         return replace(self, shape=shape, metadata=self.metadata_for(shape), **unknown)
 
     def restored_as(self, scale: int, mosaic: str | None) -> "StackInfo":

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from contextlib import suppress
 from datetime import UTC, datetime
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 from xml.etree import ElementTree
 
 import numpy as np
@@ -64,7 +64,7 @@ def camera_name(make: object, model: object) -> str | None:
     return None if not name else name if repeated else f"{maker} {name}"
 
 
-def time_attributes(attributes: Mapping[str, Any]) -> Table:
+def time_attributes(attributes: Table) -> Table:
     """Those attributes whose names are used for times, their unit, and the frame rate."""
     return {
         name: value
@@ -73,7 +73,7 @@ def time_attributes(attributes: Mapping[str, Any]) -> Table:
     }
 
 
-def times_of_attributes(attributes: Mapping[str, Any], count: int) -> Table:
+def times_of_attributes(attributes: Table, count: int) -> Table:
     """Times of ``count`` frames, and frame rate, of HDF5 and Zarr attributes such as ``timestamps_ms``, ``frame_rate``.
 
     The unit of times is that of the attribute with ``_unit`` or ``_units`` appended, or the ending of the name;
@@ -119,7 +119,7 @@ def attributes_of(info: StackInfo) -> Table:
     return {name: value for name, value in stated.items() if value is not None}
 
 
-def info_from_attributes(attributes: Mapping[str, Any], shape: tuple[int, ...], dtype: np.dtype) -> StackInfo:
+def info_from_attributes(attributes: Table, shape: tuple[int, ...], dtype: np.dtype) -> StackInfo:
     """A stored array as a stack; the attributes are those of ``attributes_of``, or times of other programs."""
     axes = str(attributes.get("axes", {2: "HW", 3: "THW", 4: "TCHW"}.get(len(shape), "")))
     if len(axes) != len(shape) or axes not in ("HW", "THW", "TCHW", "THWC") or min(shape) < 1:
@@ -217,7 +217,7 @@ def _ome_fields(text: str, count: int) -> Table:
     return fields
 
 
-def tiff_times(tif: tifffile.TiffFile, count: int, metadata: Mapping[str, Any]) -> Table:
+def tiff_times(tif: tifffile.TiffFile, count: int, metadata: Table) -> Table:
     """Times of ``count`` frames or frame rate of a TIFF file.
 
     They are stated by the ``metadata`` that this package writes, OME-XML, ImageJ (``finterval``), or on every page by a

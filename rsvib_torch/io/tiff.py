@@ -253,7 +253,7 @@ def _metadata(tif: tifffile.TiffFile, info: StackInfo) -> dict[str, Tag | None]:
     others = [cast(tifffile.TiffPage, tif.pages.get(number)) for number in numbers if 0 < number < len(tif.pages)]
     found: dict[str, Tag | None] = {}
 
-    def add(name: str, values: Sequence[Any], code: int, dtype: int, count: int, scope: Scope) -> None:
+    def add(name: str, values: Sequence[object], code: int, dtype: int, count: int, scope: Scope) -> None:
         """Add the values of the first page and of the others, in which they may be missing."""
         if any(value not in (None, values[0]) for value in values[1:]):
             found[f"{name} (differs between pages)"] = None

@@ -11,11 +11,11 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Se
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import lru_cache
+from functools import lru_cache, partial
 from io import BytesIO
 from itertools import chain, count, islice, pairwise, repeat
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from rsvib_torch.numerics.tables import Array
 
 if TYPE_CHECKING:
     import av
+    from av.container import InputContainer, OutputContainer
 
 CONTAINERS = {".mkv": "matroska", ".mp4": "mp4", ".mov": "mov", ".m4v": "mp4"}  # of the videos that are written
 # constant rate factor, 0 (no loss) to 51, of which less than 18 are hardly visible; no macroblock tree, with which x264
@@ -49,33 +50,32 @@ _GOPRO_FIRMWARE = {
     "HD7.01": "GoPro HERO7 Black",
 }  # the first characters of its version
 _FRAMES = 8  # decoded frames of a decoder; each has at most 6 bytes per pixel
-_END: Any = object()  # of packets
+_av = partial(needed_package, "av", "reading and writing video", "video")
 
 
-def _av() -> Any:
-    return needed_package("av", "reading and writing video", "video")
-
-
-def open_container(video: Path | IO[bytes]) -> Any:
+def open_container(video: Path | IO[bytes]) -> InputContainer:
     """Open a video for decoding; formats that refer to other files (playlists) are refused."""
     formats = "matroska,webm,avi,mov,mp4,mpegts,mpeg,mpegvideo,asf"
     av = _av()
     before = {"metadata_errors": "replace"} if int(av.__version__.partition(".")[0]) < 19 else {}  # later: always
-    return av.open(str(video) if isinstance(video, Path) else video, options={"format_whitelist": formats}, **before)
+    file, options = str(video) if isinstance(video, Path) else video, {"format_whitelist": formats}
+    container: InputContainer = av.open(file, options=options, **before)
+    return container
 
 
-def _orientation(frame: Any) -> int:
+def _orientation(frame: av.VideoFrame) -> int:
     """Value of the orientation tag that corresponds to the display matrix of a frame."""
     data = frame.side_data.get("DISPLAYMATRIX")
-    matrix = np.zeros(5) if data is None else np.frombuffer(bytes(data), np.int32)[:5][[0, 1, 3, 4]]
+    matrix = np.zeros(5) if data is None else np.asarray(data).view(np.int32)[:5][[0, 1, 3, 4]]
     signs = tuple(np.rint(matrix / max(1, *np.abs(matrix))).tolist())
     return next((tag for tag, stored in _MATRICES.items() if stored == signs), 1)
 
 
-def _conversion() -> Any:
+def _conversion() -> int:
     """Options for the conversion of colours; without them the mean of a frame changes by more than one count of 255."""
-    flags = _av().video.reformatter.Interpolation
-    return flags.BILINEAR | flags.FULL_CHR_H_INT | flags.ACCURATE_RND
+    kinds = _av().video.reformatter.Interpolation
+    flags: int = kinds.BILINEAR | kinds.FULL_CHR_H_INT | kinds.ACCURATE_RND
+    return flags
 
 
 def _decoded_as(layout: av.VideoFormat) -> tuple[str, float]:
@@ -94,15 +94,25 @@ def _pixels(frame: av.VideoFrame) -> Array:
     return np.ascontiguousarray(pixels if pixels.ndim == 2 else np.moveaxis(pixels, -1, 0))
 
 
-def _frames(container: Any) -> Generator[av.VideoFrame, None, None]:
+def _main_stream(container: InputContainer) -> av.VideoStream:
+    """The stream of a video that players show."""
+    best = container.streams.best("video")
+    for stream in container.streams.video:
+        if stream is best:
+            return stream
+    raise ValueError("it contains no video stream")
+
+
+def _frames(container: InputContainer) -> Generator[av.VideoFrame, None, None]:
     """Decode the frames of the main video stream in the order of presentation; damaged packets are skipped."""
-    av, stream, packet = _av(), container.streams.best("video"), None
+    av, stream = _av(), _main_stream(container)
     stream.thread_type = "AUTO"
     packets = container.demux(stream)
-    while packet is not _END:
+    while True:
         with suppress(av.error.InvalidDataError):
-            packet = next(packets, _END)
-            yield from () if packet is _END else packet.decode()
+            if (packet := next(packets, None)) is None:
+                return
+            yield from packet.decode()
 
 
 @dataclass(frozen=True)
@@ -125,19 +135,19 @@ class Picture:
         return (0.0, 255.0) if self.color_range == _FULL_RANGE or self.layout == "yuvj420p" else (16.0, 235.0)
 
 
-def _time_of(frame: Any, stream: Any) -> Fraction | None:
-    """Presentation time of a decoded frame or of a packet in s; None if it is not known."""
-    return None if frame.pts is None else Fraction(frame.pts) * stream.time_base
+def _seconds(ticks: int | None, unit: Fraction | None) -> Fraction | None:
+    """Presentation time in s of a frame or packet; None if it is not known."""
+    return None if ticks is None or unit is None else ticks * unit
 
 
-def _listed_times(container: Any, stream: Any) -> list[Fraction | None] | None:
+def _listed_times(container: InputContainer, stream: av.VideoStream) -> list[Fraction | None] | None:
     """Presentation times in s of all frames that an MP4 file lists; None if frames must be decoded to find them."""
     if "mp4" not in container.format.name:
         return None
     listed = [packet for packet in container.demux(stream) if packet.size]
     if any(packet.is_corrupt or packet.is_discard for packet in listed):
         return None
-    times = sorted({time for packet in listed if (time := _time_of(packet, stream)) is not None})
+    times = sorted({time for packet in listed if (time := _seconds(packet.pts, stream.time_base)) is not None})
     return [*times] if len(times) == len(listed) == stream.frames else None
 
 
@@ -158,9 +168,8 @@ def _scan(path: Path, size: int, changed: int) -> tuple[StackInfo, tuple[Fractio
     ``changed`` (ns) identify the state of the file.
     """
     with open_container(path) as container:
-        stream = container.streams.best("video")
-        if stream is None:
-            raise ValueError("it contains no video stream")
+        stream = _main_stream(container)
+        unit = stream.time_base or Fraction(0)
         size = stream.width * stream.height
         check_fits(f"{path}: frames of {stream.height} x {stream.width} px", _FRAMES * 6 * size, "free more memory")
         times = _listed_times(container, stream)
@@ -169,7 +178,7 @@ def _scan(path: Path, size: int, changed: int) -> tuple[StackInfo, tuple[Fractio
             if first is None:
                 raise ValueError("no frame can be decoded")
             if times is None:
-                times = [_time_of(frame, stream) for frame in chain([first], frames)]
+                times = [_seconds(frame.pts, unit) for frame in chain([first], frames)]
         known = [time for time in times if time is not None]
         rising = len(known) == len(times) > 1 and all(a < b for a, b in pairwise(known))
         pixels, rate = _pixels(first), stream.average_rate
@@ -184,7 +193,7 @@ def _scan(path: Path, size: int, changed: int) -> tuple[StackInfo, tuple[Fractio
         stated = known
         if rising and rate:  # Matroska rounds times to 1 ms: 5 frames at 69.44 per second, its frame rate, have 68.97
             even = [known[0] + round((time - known[0]) * rate) / rate for time in known]
-            if all(abs(a - b) <= stream.time_base for a, b in zip(even, known, strict=True)):
+            if all(abs(a - b) <= unit for a, b in zip(even, known, strict=True)):
                 stated = even
         if first.interlaced_frame:
             raise ValueError(
@@ -199,7 +208,7 @@ def _scan(path: Path, size: int, changed: int) -> tuple[StackInfo, tuple[Fractio
             channels_last=pixels.ndim == 3,
             frame_rate=None if rising or not rate else float(rate),
             orientation=_orientation(first),
-            time_error=float(stream.time_base),
+            time_error=float(unit),
             time_source="time stamps",
             camera=_camera(container.metadata | stream.metadata),
         )
@@ -230,10 +239,10 @@ class VideoReader:
         with open_container(self._path) as container, closing(_frames(container)) as decoded:
             frame = next(decoded, None)
             for expected in self._times or repeat(None, self.info.shape[0]):
-                time = None if frame is None or expected is None else _time_of(frame, frame)
+                time = None if frame is None or expected is None else _seconds(frame.pts, frame.time_base)
                 while time is not None and expected is not None and time < expected:
                     frame = next(decoded, None)
-                    time = None if frame is None else _time_of(frame, frame)
+                    time = None if frame is None else _seconds(frame.pts, frame.time_base)
                 if time is not None and expected is not None and time > expected:
                     yield None
                 else:
@@ -303,10 +312,10 @@ class VideoEncoder:
 
     def __init__(
         self,
-        container: Any,
+        container: OutputContainer,
         path: Path,
         info: StackInfo,
-        source: Any,
+        source: InputContainer | None,
         picture: Picture | None = None,
         options: Mapping[str, str] = {},
     ) -> None:
@@ -321,8 +330,9 @@ class VideoEncoder:
         self.unit, self.ticks = presentation_times(info)
         self.step = int(np.median(np.diff(self.ticks))) if len(self.ticks) > 1 else 1
         rate = 1 / (self.unit * self.step) if len(self.ticks) > 1 else Fraction(_DEFAULT_RATE)
-        codec, usual = ("libx264", _H264_OPTIONS) if lossy else ("ffv1", _FFV1_OPTIONS)
-        self._stream = video = container.add_stream(codec, rate=rate, options={**usual, **options})
+        codec: Literal["libx264", "ffv1"] = "libx264" if lossy else "ffv1"
+        options = {**(_H264_OPTIONS if lossy else _FFV1_OPTIONS), **options}
+        self._stream = video = container.add_stream(codec, rate=rate, options=options)
         video.height, video.width = info.shape[-2:]
         video.pix_fmt, encoder = self._encoded, video.codec_context
         encoder.time_base = video.time_base = self.unit
@@ -334,7 +344,7 @@ class VideoEncoder:
             encoder.colorspace, encoder.color_range = _BT709, _LIMITED_RANGE
         if source is not None:
             container.metadata.update(source.metadata)
-            taken = source.streams.best("video").codec_context
+            taken = _main_stream(source).codec_context
             encoder.color_primaries, encoder.color_trc = taken.color_primaries, taken.color_trc
             if taken.sample_aspect_ratio:
                 encoder.sample_aspect_ratio = taken.sample_aspect_ratio
@@ -348,15 +358,16 @@ class VideoEncoder:
         encoded.pts, encoded.time_base = tick, self.unit
         self._container.mux(self._stream.encode(encoded))
 
-    def _converted(self, frame: Array) -> Any:
+    def _converted(self, frame: Array) -> av.VideoFrame:
+        make: Callable[..., av.VideoFrame] = _av().VideoFrame.from_ndarray
         if self._picture is not None:
-            return _av().VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="yuv420p")
+            return make(np.ascontiguousarray(frame), format="yuv420p")
         counts = np.moveaxis(frame, 0, -1) if frame.shape[:-2] == (3,) else frame.reshape(frame.shape[-2:])
         if self._full_scale != self._info.full_scale:
             relative = counts / (self._info.full_scale or 1.0)  # the full scale of floats is 1
             counts = np.rint(self._full_scale * np.clip(np.nan_to_num(relative), 0.0, 1.0))
         counts = np.ascontiguousarray(counts, dtype=np.uint8 if self._full_scale <= 255 else np.uint16)
-        converted = _av().VideoFrame.from_ndarray(counts, format=self._layout)
+        converted = make(counts, format=self._layout)
         if self._encoded != self._layout:
             converted = converted.reformat(format=self._encoded, dst_colorspace="ITU709", interpolation=_conversion())
         return converted
@@ -369,23 +380,28 @@ class VideoEncoder:
 class Sound:
     """Sound of another open video (None: none), copied between the frames of an open video to write."""
 
-    def __init__(self, output: Any, source: Any) -> None:
+    def __init__(self, output: OutputContainer, source: InputContainer | None) -> None:
         streams = source.streams.audio if source is not None else ()
         self._output, self._added = output, {stream: output.add_stream_from_template(stream) for stream in streams}
-        packets = source.demux(*self._added) if self._added else ()
+        packets = source.demux(streams) if source is not None and streams else ()
         # the last packet of a stream is empty
-        self._packets = (packet for packet in packets if packet.dts is not None and packet.pts is not None)
+        self._packets = (
+            (time, packet)
+            for packet in packets
+            if packet.dts is not None and (time := _seconds(packet.pts, packet.time_base)) is not None
+        )
         self._next = next(self._packets, None)
 
     def write(self, until: Fraction | None = None) -> None:
         """Write the packets up to a time in s, because players read sound and frames together; None for all."""
-        while self._next is not None and (until is None or self._next.pts * self._next.time_base <= until):
-            self._next.stream = self._added[self._next.stream]
-            self._output.mux(self._next)
+        while self._next is not None and (until is None or self._next[0] <= until):
+            packet = self._next[1]
+            packet.stream = self._added[packet.stream]
+            self._output.mux(packet)
             self._next = next(self._packets, None)
 
 
-def open_source(info: StackInfo, opened: ExitStack) -> Any:
+def open_source(info: StackInfo, opened: ExitStack) -> InputContainer | None:
     """The open video from which the frames to write were computed, closed with ``opened``; None if there is none."""
     path = _source(info)
     return None if path is None else opened.enter_context(open_container(path))
@@ -409,10 +425,11 @@ def check_video(path: Path, info: StackInfo) -> None:
                 raise ValueError(f"{path}: {ending} cannot hold the audio ({name}) of {info.path}; write .mkv")
 
 
-def open_output(path: Path, opened: ExitStack) -> Any:
+def open_output(path: Path, opened: ExitStack) -> OutputContainer:
     """The container of a video to write, closed with ``opened``; equal content gives equal bytes."""
-    options = {"fflags": "+bitexact"}
-    return opened.enter_context(_av().open(str(path), "w", format=CONTAINERS[path.suffix.lower()], options=options))
+    ending, options = path.suffix.lower(), {"fflags": "+bitexact"}
+    output: OutputContainer = _av().open(str(path), "w", format=CONTAINERS[ending], options=options)
+    return opened.enter_context(output)
 
 
 def write_video(path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None) -> None:
@@ -460,7 +477,7 @@ def join_parts(path: Path, info: StackInfo, parts: Iterable[IO[bytes]]) -> None:
         if source is not None:
             output.metadata.update(source.metadata)
         durations = np.diff(ticks, append=2 * ticks[-1] - ticks[-2] if len(ticks) > 1 else ticks[0] + 1).tolist()
-        video: Any = None
+        video: av.VideoStream | None = None
         index = 0
         for part in parts:
             with part, open_container(part) as container:

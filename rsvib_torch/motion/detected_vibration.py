@@ -1,7 +1,7 @@
 """A detected vibration with its uncertainty and verdict: what restoration needs of a detection."""
 
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from torch import Tensor
 from torch.nn import functional
@@ -20,6 +20,7 @@ from rsvib_torch.results.presentation import (
     plain_values,
     verdict_table,
 )
+from rsvib_torch.results.reason import Findings
 from rsvib_torch.text import measured_text, text_table, wrapped
 
 _UNITS_OF_AXES = ("px", "px", "rad", "relative")  # in names of columns
@@ -46,8 +47,8 @@ class DetectedVibration(
     gain: Tensor
     residual: Tensor
     reliable: Tensor
-    findings: tuple[Any, ...]
-    assumptions: tuple[Any, ...]
+    findings: Findings
+    assumptions: tuple[object, ...]
     std_if_hidden_tone: VibrationStd | None = field(default=None, kw_only=True)
 
     @classmethod

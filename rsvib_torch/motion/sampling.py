@@ -1,7 +1,6 @@
 """Where in a recorded frame each pixel of the restored frame was recorded."""
 
 import math
-from typing import Any
 
 import numpy as np
 import torch
@@ -83,7 +82,7 @@ def _interpolation(length: int, count: int) -> tuple[Array, Array]:
 
 
 def places(
-    offsets: Array, weights: Array, timing: SensorTiming, size: tuple[int, int], dtype: Any = np.float32
+    offsets: Array, weights: Array, timing: SensorTiming, size: tuple[int, int], dtype: type[np.floating] = np.float32
 ) -> Array:
     """(2, H, W) px, the places (x, y) of all pixels with the offsets of ``recorded_offsets``."""
     along, across = (1, 0) if timing.scan_axis == -2 else (0, 1)

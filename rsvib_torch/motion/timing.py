@@ -12,11 +12,11 @@ import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from rsvib_torch.checks.validation import Positive, options, validate
 from rsvib_torch.checks.values import check_choice, check_number, check_whole_number, described
-from rsvib_torch.files.reading import read_toml
+from rsvib_torch.files.reading import Table, read_toml
 
 if TYPE_CHECKING:
     import torch
@@ -271,7 +271,7 @@ class SensorTiming:
             f"{num_rows * self.row_time:.3g} s; check frame_start_times and frame_rows, or {remedy}"
         )
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Table:
         """The arguments that make this timing, as plain numbers and texts."""
         starts = self.frame_start_times
         scan_axis = "x" if self.scan_axis == -1 else "y"

@@ -20,12 +20,12 @@ interpolated.
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
+from torch.autograd.function import BackwardCFunction, once_differentiable
 
 
 class _Solution(NamedTuple):
@@ -205,7 +205,7 @@ class _Solve(torch.autograd.Function):
     """Solve; the gradients of ``x = A^-1 g`` are ``A^-1 dx`` for g and ``-(A^-1 dx) x^H`` for A."""
 
     @staticmethod
-    def forward(ctx: Any, system: Tensor | BandedFactor, right_side: Tensor) -> Tensor:
+    def forward(ctx: BackwardCFunction, system: Tensor | BandedFactor, right_side: Tensor) -> Tensor:
         if isinstance(system, BandedFactor):
             factor = system
         else:
@@ -217,8 +217,8 @@ class _Solve(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor]:
-        *tensors, x = ctx.saved_tensors
+    def backward(ctx: BackwardCFunction, gradient: Tensor) -> tuple[Tensor | None, Tensor]:
+        *tensors, x = list(ctx.saved_tensors)
         factor = BandedFactor.of_tensors(*tensors)
         adjoint = factor.solve(gradient)
         if not ctx.needs_input_grad[0]:

@@ -7,6 +7,7 @@ from math import comb, factorial
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.special import roots_legendre
 from torch import Tensor
 
 from rsvib_torch.execution.chunking import runs
@@ -208,8 +209,6 @@ def _across(samples: Tensor, kernels: Tensor, step: int, length: int) -> Tensor:
 @cache
 def gauss_legendre(count: int) -> tuple[Tensor, Tensor]:
     """Gauss-Legendre nodes (N,) within 0 ... 1, and weights that sum to 1, float64; cached, do not modify them."""
-    from scipy.special import roots_legendre  # noqa: PLC0415 - takes 0.1 s
-
     nodes, weights = roots_legendre(count)  # 10,000 nodes in 2 s; numpy.polynomial.legendre.leggauss: minutes
     with torch.inference_mode(False):  # later callers may differentiate
         return torch.from_numpy((nodes + 1) / 2), torch.from_numpy(weights / 2)

@@ -234,8 +234,7 @@ def _products(sums: Tensor) -> tuple[Tensor, Tensor]:
 
 def _means(products: Tensor) -> Tensor:
     """Weighted means (B, s, A + 1, 1) of the images."""
-    means: Tensor = products[..., :-1, -1:] / products[..., -1:, -1:].clamp(min=1e-6)
-    return means
+    return products[..., :-1, -1:] / products[..., -1:, -1:].clamp(min=1e-6)
 
 
 def _sums_of_parts(weighted: Tensor, rows: _Rows, edges: list[int]) -> Tensor:
@@ -265,8 +264,7 @@ def _solve(products: Tensor, right: Tensor) -> Tensor:
         + torch.where(usable, scale.new_tensor(1e-6), 1.0)[..., None] * eye
     )
     solution = torch.linalg.solve(unit, (right * scale[..., None, :]).transpose(-2, -1)).transpose(-2, -1)
-    factors: Tensor = solution * scale[..., None, :]
-    return factors
+    return solution * scale[..., None, :]
 
 
 def _sum_of_blocks(values: Tensor) -> Tensor:
@@ -275,8 +273,7 @@ def _sum_of_blocks(values: Tensor) -> Tensor:
     if -rows % BLOCK:
         values = functional.pad(values, (0, 0, 0, -rows % BLOCK))
     strips = values.unflatten(1, (-1, BLOCK)).sum(2)
-    sums: Tensor = functional.pad(strips, (0, -columns % BLOCK)).unflatten(2, (-1, BLOCK)).sum(3)
-    return sums
+    return functional.pad(strips, (0, -columns % BLOCK)).unflatten(2, (-1, BLOCK)).sum(3)
 
 
 def _block_weight(energy: Tensor, slope: Tensor, share: Tensor) -> Tensor:
@@ -392,8 +389,7 @@ def _with_little_aliasing(scene_power: Tensor, noise_power: Tensor, u: Tensor, a
     fall = torch.acosh((power[:, place] / highest).clamp(1.0, 1e6)) / below[place]
     aliased = 0.5 * highest[:, None] * torch.exp(-fall[:, None] * below)
     noise = noise_power.masked_fill(~passed, math.inf).amin((1, 2))[:, None] * across.sum()
-    factors: Tensor = (1 / (1 + aliased / (2 * noise + _LEAST_ALIASED * power)))[..., None]
-    return factors
+    return (1 / (1 + aliased / (2 * noise + _LEAST_ALIASED * power)))[..., None]
 
 
 def _pass_bands(u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:

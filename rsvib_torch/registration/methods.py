@@ -31,8 +31,7 @@ def register_ncc(task: BandTask) -> tuple[Tensor, Tensor]:
 
     def binned(image: Tensor, left: Tensor, columns: int) -> Tensor:
         whole = take_windows(image, torch.zeros_like(left), left, height, columns * factor)[:, 0]
-        means: Tensor = whole.unflatten(-1, (columns, factor)).mean(-1)
-        return means
+        return whole.unflatten(-1, (columns, factor)).mean(-1)
 
     first = binned(task.first, task.left[:, None], width)
     left = (task.left + task.coarse[:, 0])[:, None] - reach * factor
@@ -200,8 +199,7 @@ def _phase_surface(
         angle = 2 * torch.pi * lags[:, None] * frequency
         transforms.append(torch.polar(torch.ones_like(angle), angle))
     surface = (transforms[0] @ ((cross * weight) @ transforms[1].T)).real
-    lags_of_bands: Tensor = (surface / full.clamp(min=torch.finfo(first.dtype).tiny)[:, None, None]).unflatten(0, shape)
-    return lags_of_bands
+    return (surface / full.clamp(min=torch.finfo(first.dtype).tiny)[:, None, None]).unflatten(0, shape)
 
 
 # Gray projection (Sec. 2.2 of Liu et al. 2023)

@@ -203,7 +203,7 @@ def _draw_offsets(upper: Axes, lower: Axes, result: DetectionResult, axis: int) 
 
 def offset_panels(result: DetectionResult, axes: Sequence[int], width: float, height: float) -> tuple[Figure, Panels]:
     """Figure of the offsets of some axes with their fit and residuals, and its panels (2, axes)."""
-    check_single("result", result)
+    check_single("result", result.batch_shape)
     sharex = len(result.offsets.pairs) <= _MOST_PAIRS or "row"  # all pairs are shown, or only below
     figure, panels = _panels(width, height, 2, len(axes), sharex=sharex, height_ratios=(3, 1))
     points = [_draw_offsets(panels[0, column], panels[1, column], result, axis) for column, axis in enumerate(axes)]
@@ -322,7 +322,7 @@ def motion_figure(motion: Motion, first: float = 0.0, last: float | None = None)
         >>> motion_figure(Vibration([3.1, 5.2], [50.0, 30.0])).axes[0].get_xlabel()
         'time (ms)'
     """
-    check_single("motion", motion)
+    check_single("motion", motion.batch_shape)
     if isinstance(motion, FreeMotion):
         first, last = motion.start, motion.end if last is None else last
     if last is None:
@@ -394,7 +394,7 @@ def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
         >>> gain_figure(rsv.detect_vibration(frames, timing, method="bands"), timing).axes[-1].get_xlabel()
         'frequency (Hz)'
     """
-    check_single("result", result)
+    check_single("result", result.batch_shape)
     vibration, std = result.vibration, result.std
     highest = max(1.35 * float((vibration.frequency * (vibration.amplitude > 0)).max()), 4.2 / timing.frame_period)
     frequency = np.linspace(0.0, highest, 2000)
@@ -440,7 +440,7 @@ def rows_figure(vibration: Motion, timing: SensorTiming, num_rows: Count) -> Fig
         >>> [panel.get_ylabel() for panel in figure.axes]
         ['displacement (px)', 'motion blur (px)']
     """
-    check_single("vibration", vibration)
+    check_single("vibration", vibration.batch_shape)
     vibration = vibration.detached()
     starts = timing.row_starts(1, num_rows)[0]
     figure, ((upper,), (lower,)) = _panels(5.6, 4.6, 2, sharex=True)
@@ -463,7 +463,7 @@ def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: Count) -> Figu
         >>> len(psf_figure(Vibration([3.1, 5.2], [50.0, 30.0]), timing, num_rows=2048).axes)
         24
     """
-    check_single("vibration", vibration)
+    check_single("vibration", vibration.batch_shape)
     vibration = vibration.detached()
     down, across = 3, 8
     rows = torch.linspace(0, num_rows - 1, down * across, dtype=torch.float32, device="cpu").round()

@@ -35,7 +35,7 @@ def write_vibration(path: str | os.PathLike[str], result: DetectionResult, timin
         result: A detection (not a batch).
         timing: The sensor; by default ``result.timing``.
     """
-    check_single("result", result)
+    check_single("result", result.batch_shape)
     timing = timing or result.timing
     if timing is None:
         raise ValueError("timing unknown: pass timing=SensorTiming(...) of the frames")
@@ -106,7 +106,7 @@ def write_offsets(path: str | os.PathLike[str], result: DetectionResult) -> None
     One line per band (or row, in the direct method) and pair of frames, see docs/export.md: ``offset`` before
     correction, ``fitted`` by the vibration, ``residual = offset - fitted`` after it, and ``std`` of both.
     """
-    check_single("result", result)
+    check_single("result", result.batch_shape)
     curve = result.offsets
     earlier, later = curve.pairs.T[..., None]
     columns = {"earlier_frame": earlier, "later_frame": later, "row": curve.rows, "time_s": curve.times}

@@ -127,7 +127,7 @@ class FixedDewarp(nn.Module):
         super().__init__()
         check_timing(timing)
         check_two_axes(vibration, "FixedDewarp")
-        check_single("vibration", vibration)
+        check_single("vibration", vibration.batch_shape)
         check_whole_number("num_frames", num_frames, at_least=1)
         sides = [check_whole_number("size", side, at_least=1, at_most=MAX_ROWS) for side in size]
         height, width = sides if timing.scan_axis == -2 else sides[::-1]

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import torch
@@ -30,6 +30,7 @@ from rsvib_torch.motion.field import ColumnMotion, largest_in_frame, largest_slo
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.sampling import places, recorded_offsets
 from rsvib_torch.motion.timing import MAX_ROWS, RowTiming, SensorTiming
+from rsvib_torch.options import RestorationOptions
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,11 +163,14 @@ class MovingFrames:
         """Prepared frames with their motion."""
         return cls(frames.filled, motion, frames.missing, frames.saturated, frames.colours)
 
-    def mapped(self, change: Callable[[Tensor], Tensor], **stated: Any) -> Self:
-        """The frames with a change of images and masks, and other values of further fields."""
+    def mapped(self, change: Callable[[Tensor], Tensor]) -> Self:
+        """The frames with a change of images and masks."""
         tensors = ((field.name, getattr(self, field.name)) for field in fields(self))
         changed: Table = {name: change(values) for name, values in tensors if isinstance(values, Tensor)}
-        return replace(self, **changed, **stated)
+        return replace(self, **changed)
+
+
+Method = Callable[[MovingFrames, RestorationOptions], Tensor]  # see ``METHODS`` of restore.py
 
 
 @checks_arguments
@@ -270,7 +274,7 @@ def _strips(motion: Motion, size: tuple[int, int], first: float, last: float) ->
     return strips, slope * math.hypot(strips.width / math.sqrt(12), distance)
 
 
-def restore_in_strips(method: Callable[[MovingFrames, Any], Tensor], frames: MovingFrames, options: object) -> Tensor:
+def restore_in_strips(method: Method, frames: MovingFrames, options: RestorationOptions) -> Tensor:
     """Frames restored by one of ``METHODS``, in strips of columns if the motion has roll or zoom."""
     motion, timing = frames.motion, frames.motion.timing
     count, (height, width) = frames.images.shape[1], frames.images.shape[-2:]
@@ -283,5 +287,6 @@ def restore_in_strips(method: Callable[[MovingFrames, Any], Tensor], frames: Mov
     of_strips = ColumnMotion.of_columns(motion.vibration, strips.columns, timing, count, height)
     of_frames = replace(frame_motion(of_strips, timing, count, height), neglected=neglected)
     of_frames.check_fits(width)
-    restored = method(frames.mapped(strips.cut, motion=of_frames, strips=len(strips.firsts)), options)
+    cut = replace(frames.mapped(strips.cut), motion=of_frames, strips=len(strips.firsts))
+    restored = method(cut, options)
     return strips.finer(restored.shape[-1] // strips.width).joined(restored)

@@ -1,9 +1,7 @@
 """Restoration of frames: input preparation, one of the methods, and a check of the result."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -26,6 +24,7 @@ from rsvib_torch.restoration.dewarp import restore_dewarp
 from rsvib_torch.restoration.exact.exact import restore_exact
 from rsvib_torch.restoration.frame_motion import (
     FrameMotion,
+    Method,
     MovingFrames,
     frame_motion,
     motion_of_frames,
@@ -53,7 +52,7 @@ from rsvib_torch.results.reason import Reason
 #
 # Frames of one stack must not affect other stacks, but for the length to which rows are extended; ``frames`` must not
 # be changed, and gradients must flow to frames and motion. Recipe of a new method: docs/architecture.md.
-METHODS: dict[str, Callable[[MovingFrames, Any], Tensor]] = {
+METHODS: dict[str, Method] = {
     "exact": restore_exact,
     "banded": restore_banded,
     "dewarp": restore_dewarp,

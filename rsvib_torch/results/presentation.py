@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # The function that draws a result of this type with this number of leading dimensions (0: not a batch).
-FIGURES: "dict[tuple[type, int], Callable[[Any], Figure]]" = {}
+FIGURES: "dict[tuple[type, int], Callable[..., Figure]]" = {}
 
 # Text
 
@@ -338,7 +338,7 @@ class Result(Summarised):
             write_figure(figure, path)
         return figure
 
-    def _figure_function(self) -> "Callable[[Any], Figure] | None":
+    def _figure_function(self) -> "Callable[..., Figure] | None":
         IMPORTERS["figures"]()  # adds to the table
         return FIGURES.get((type(self), len(self.batch_shape)))
 

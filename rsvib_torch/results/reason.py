@@ -14,6 +14,7 @@ from operator import attrgetter
 from string import Formatter
 from typing import Any
 
+from rsvib_torch.files.reading import Table
 from rsvib_torch.text import quoted
 
 Findings = tuple[Any, ...]  # reasons, or such a tuple for each axis, or for each result of a batch
@@ -96,7 +97,7 @@ class Reason:
         return {"code": self.code, "axis": self.axis, **compared, "details": numbers, "text": str(self)}
 
     @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> "Reason":
+    def from_dict(cls, values: Table) -> "Reason":
         """Inverse of ``to_dict``; a code that this version does not know becomes ``"unspecified"`` with its text."""
         code, axis = values.get("code"), values.get("axis")
         if code not in REASONS:
@@ -144,7 +145,7 @@ def texts(findings: Findings, text: Callable[[Reason], str] = attrgetter("with_a
 
 def read_findings(values: object) -> Reason | Findings:
     """Reasons in nested lists as JSON files have them."""
-    if isinstance(values, Mapping):
+    if isinstance(values, dict):
         return Reason.from_dict(values)
     if not isinstance(values, (list, tuple)):
         raise ValueError(f"findings: expected a list of reasons, got {quoted(values)}")

@@ -35,32 +35,29 @@ def result_of(kind: type[R], data: Table, path: Path) -> R:
             f"{quoted(found)} of version {quoted(data.get('version'))}{reader}"
         )
     try:
-        result: R = decode(kind, data, "")
+        return decode(kind, data, "")
     except (ValueError, RuntimeError, OverflowError) as error:  # of PyTorch and of conversions, for impossible values
         raise ValueError(f"{path}: {str(error).partition(chr(10))[0]}") from error
-    return result
 
 
-def decode(kind: object, value: object, path: str, missing: float = math.nan) -> Any:
-    """A value of an annotated type from what ``plain_values`` made of it; ``check_fields`` checks the other types.
-
-    ``path`` is its place in the file, for messages; ``missing`` is what None stands for in a tensor.
-    """
+def _decoded(kind: object, value: object, path: str, missing: float) -> object:
+    """A value of an annotated type from what ``plain_values`` made of it; ``missing``: what None is in a tensor."""
     kind = next(iter(members_of(kind)))
     origin, parts = get_origin(kind), get_args(kind)
     if kind is Tensor:
         return _tensor(value, path, missing)
-    if is_dataclass(kind):
-        return _dataclass(kind, value, path)
+    if isinstance(kind, type) and hasattr(kind, "__dataclass_fields__"):
+        return decode(kind, value, path)
     if origin is dict and isinstance(value, dict):
-        return {key: decode(parts[1], entry, f"{path}.{key}", missing) for key, entry in value.items()}
-    if origin is tuple and is_dataclass(parts[0]) and isinstance(value, list):
+        return {key: _decoded(parts[1], entry, f"{path}.{key}", missing) for key, entry in value.items()}
+    if origin is tuple and hasattr(parts[0], "__dataclass_fields__") and isinstance(value, list):
         return tuple(decode(parts[0], entry, f"{path}[{number}]") for number, entry in enumerate(value))
     return value if kind is Any else _tuples(value)
 
 
-def _dataclass(kind: Any, value: object, path: str) -> Any:
-    if not isinstance(value, dict):
+def decode(kind: type[R], value: object, path: str) -> R:
+    """A dataclass from what ``plain_values`` made of it; ``path`` is its place in the file, for messages."""
+    if not (isinstance(value, dict) and is_dataclass(kind)):
         raise ValueError(f"{path}: expected a table, got {quoted(value)}")
     hints, start, missing = hints_of(kind), f"{path}." if path else "", getattr(kind, "_MISSING", math.nan)
     values: Table = {}
@@ -73,7 +70,7 @@ def _dataclass(kind: Any, value: object, path: str) -> Any:
             values[name] = read_findings(value[name])
         else:
             is_none = value[name] is None and types.NoneType in get_args(hint)
-            values[name] = None if is_none else decode(hint, value[name], start + name, missing)
+            values[name] = None if is_none else _decoded(hint, value[name], start + name, missing)
     try:
         made = kind(**values)
         check_fields(made)

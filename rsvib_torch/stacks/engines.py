@@ -7,7 +7,8 @@ from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import closing, suppress
 from dataclasses import replace
-from typing import Any, TypeVar
+from functools import partial
+from typing import TYPE_CHECKING, TypeVar
 
 import torch
 
@@ -18,7 +19,11 @@ from rsvib_torch.stacks.heap import share_one_heap
 from rsvib_torch.stacks.job import StackJob, StoredWindow, WindowFrames, WindowResult, read_windows
 from rsvib_torch.stacks.windows import Window
 
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
 _Result = TypeVar("_Result")
+_distributed = partial(needed_package, "distributed", "the Dask engine", "distributed")
 NO_WORKERS_SECONDS = 60.0  # workers of a batch system start within this time after those before them ended
 
 
@@ -36,10 +41,6 @@ def compute_here(
     return in_threads(compute, read_windows(job, windows), at_once=at_once, threads=threads)
 
 
-def _distributed() -> Any:
-    return needed_package("distributed", "the Dask engine", "distributed")
-
-
 def _compute_on_worker(job: StackJob, window: Window) -> StoredWindow:
     share_one_heap(keep_freed=True)
     if job.options.device.startswith("cuda"):  # workers with a number as their name use the GPUs in turn
@@ -52,21 +53,22 @@ def _compute_on_worker(job: StackJob, window: Window) -> StoredWindow:
         return next(results)
 
 
-def _dask_client(scheduler: str, workers: int) -> Any:
+def _dask_client(scheduler: str, workers: int) -> "Client":
     """A client of the scheduler at an address, or of a number of workers on this machine, which end with it."""
     options: Table = {"address": scheduler, "timeout": 30}
     if scheduler == "local":
         options = {"n_workers": workers, "threads_per_worker": 1, "processes": True, "memory_limit": 0}
         options |= {"dashboard_address": None, "silence_logs": logging.ERROR}
     try:
-        return _distributed().Client(**options, set_as_default=False)
+        client: Client = _distributed().Client(**options, set_as_default=False)
     except (OSError, ValueError, RuntimeError) as error:
         failed = f"no Dask scheduler answers at {scheduler}"
         failed = "Dask workers cannot be started" if scheduler == "local" else failed
         raise OSError(f"{failed}: {' '.join(str(error).split())}") from error
+    return client
 
 
-def _wait(client: Any, future: Any, window: Window) -> Any:
+def _wait(client: "Client", future: "Future[StoredWindow]", window: Window) -> StoredWindow:
     """The result of a window that Dask workers compute, as long as there are workers and a scheduler."""
     distributed = _distributed()
     last_seen = time.monotonic()
@@ -99,10 +101,10 @@ def compute_with_dask(
     scheduler ``"local"`` starts a number of workers on this machine.
     """
     job = replace(job, source=job.source.absolute())
-    waiting: deque[tuple[Any, Window]] = deque()
+    waiting: deque[tuple[Future[StoredWindow], Window]] = deque()
     with _dask_client(scheduler, workers) as client:
 
-        def submit(window: Window) -> tuple[Any, Window]:
+        def submit(window: Window) -> "tuple[Future[StoredWindow], Window]":
             # the job is sent with every task: scattered data are lost with the worker that holds them
             given = None if job.given is None else {window.index: job.given[window.index]}
             of_window = replace(job, given=given)

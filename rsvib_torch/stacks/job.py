@@ -48,7 +48,7 @@ from rsvib_torch.stacks.window_restoration import (
     restore_trusted,
     without_data,
 )
-from rsvib_torch.stacks.windows import Window, WindowRecord, cut_windows, window_timing
+from rsvib_torch.stacks.windows import Window, WindowRecord, cut_windows, record_fields, window_timing
 from rsvib_torch.tracking.following import follow_vibration
 
 WindowFrames = list[Array | str]  # pixels as stored, or why a frame cannot be read
@@ -170,7 +170,7 @@ class StackJob:
                 frames,
                 timing,
                 motion,
-                options.restoration,
+                self.chosen,
                 force=options.force,
                 first_frames=len(kept) if len(kept) > 1 and not self.chosen.joint else None,
                 most_pairs=8 if window.alone else 2,  # limits the time of the verdict
@@ -211,7 +211,7 @@ class StackJob:
             if options.restoration is None:
                 return as_followed
             frames, timing = as_taken.frames, window_timing(self.timing, window, kept)
-            restoration = restore_followed(frames, timing, followed, options.restoration, force=options.force)
+            restoration = restore_followed(frames, timing, followed, self.chosen, force=options.force)
         except (ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
             return replace(as_taken, error=" ".join(str(error).split()))
         return self._restored(as_followed, frames, restoration)
@@ -247,11 +247,9 @@ class StackJob:
         """The record of a result of which ``written`` frames were written."""
         window, restoration = result.window, result.restoration
         followed = result.indices if isinstance(result.detection, FollowedVibration) else None
-        return WindowRecord.of(
-            None if restoration is None else restoration.verdict,
-            result.bad_frames,
-            result.detection,
-            restored=result.restored,
+        verdict = None if restoration is None else restoration.verdict
+        return WindowRecord(
+            **record_fields(verdict, result.bad_frames, result.detection, restored=result.restored),
             window=window.index,
             first=window.first,
             last=window.last,

@@ -10,7 +10,6 @@ from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from statistics import median, stdev
-from typing import Any
 
 import numpy as np
 import torch
@@ -77,8 +76,7 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
     @cached_property
     def timing(self) -> SensorTiming:
         """The sensor."""
-        found: SensorTiming = decode(SensorTiming, self.settings.get("sensor"), "settings.sensor")
-        return found
+        return decode(SensorTiming, self.settings.get("sensor"), "settings.sensor")
 
     def summary(self) -> str:
         """Tones over the windows, what was restored, and what failed."""
@@ -340,11 +338,11 @@ def manifest_header(job: StackJob, output: str | None, compression: str | None) 
     }
 
 
-def stack_manifest(header: Table, records: Iterable[WindowRecord], **results: Any) -> StackManifest:
+def stack_manifest(header: Table, records: Iterable[WindowRecord]) -> StackManifest:
     """The manifest of a run, from its header and the records of all windows."""
     windows = tuple(records)
     bad = {index: reason for record in windows for index, reason in record.bad_frames.items()}
-    return StackManifest(**header, bad_frames=bad, windows=windows, **results)
+    return StackManifest(**header, bad_frames=bad, windows=windows)
 
 
 @checks_arguments

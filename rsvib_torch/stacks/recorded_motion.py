@@ -13,16 +13,14 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.checks.values import refused
-from rsvib_torch.files.reading import Table
 from rsvib_torch.gyroscope.alignment import ClockAlignment, FittedClock, MotionCheck, align_motion, check_motion
 from rsvib_torch.gyroscope.corner_tracks import corner_tracks
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
-from rsvib_torch.gyroscope.rotation_alignment import RotationAlignment, align_rates, offset_range, outside
+from rsvib_torch.gyroscope.rotation_alignment import AlignOptions, RotationAlignment, align_rates, offset_range, outside
 from rsvib_torch.io.frame_times import timing_from_first_frame
 from rsvib_torch.io.full_scale import counts_to_frames
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.io.stack_reading import open_stack
-from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.job import stored_frame
@@ -78,27 +76,23 @@ def align_stack(
     info: StackInfo,
     timing: SensorTiming,
     recorded: FreeMotion | AngularRates,
-    *,
-    camera: Camera | None = None,
-    offsets: tuple[float, float] | None = None,
-    fit_gain: bool = False,
-    fit_row_time: bool = False,
-    ignore: Tensor | None = None,
+    options: AlignOptions,
 ) -> ClockAlignment | RotationAlignment:
     """``align_motion`` for a stack of any length, in bounded time and memory.
 
     Angular rates are compared with 48 pairs of neighbouring frames over the whole stack, a motion with three runs of 16
     frames; of stacks that are not longer, all frames are used. ``info`` describes the stack, with its full scale;
-    ``timing`` is that of the caller. Pixels of ``ignore`` (H, W, bool) do not count.
+    ``timing`` is that of the caller. The mask ``ignore`` (H, W) is that of all frames.
     """
-    timing = timing_from_first_frame(timing, info)
+    timing, offsets = timing_from_first_frame(timing, info), options.offsets
     if isinstance(recorded, AngularRates):
         pairs = compared_pairs(info.shape[0])
         starts = timing.frame_starts(info.shape[0]).tolist()
+        ignore = None if options.ignore is None else torch.as_tensor(options.ignore)
         tracks = corner_tracks(_grey_frames(source, info, pairs, ignore), starts, timing)
-        more: Table = {"offsets": offsets, "fit_gain": fit_gain, "fit_row_time": fit_row_time}
-        return align_rates(tracks, timing, recorded, camera, **more)
-    runs, align = compared_runs(info.shape[0]), partial(align_motion, fit_gain=fit_gain, ignore=ignore)
+        return align_rates(tracks, timing, recorded, options)
+    runs = compared_runs(info.shape[0])
+    align = partial(align_motion, fit_gain=options.fit_gain, ignore=options.ignore)
     if len(runs) == 1:
         return align(*part_of_stack(source, info, timing, runs[0]), recorded, offsets=offsets)
     return _aligned_runs(source, info, timing, recorded, runs, offsets, align)

@@ -23,7 +23,7 @@ from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import IO, Any, Literal
+from typing import IO, Literal
 
 import numpy as np
 
@@ -165,12 +165,13 @@ class RunFolder:
             os.fsync(file.fileno())
         os.fsync(self._folder)
 
-    def _content(self, name: str, key: bytes = b"") -> Any:
+    def _content(self, name: str, key: bytes = b"") -> Table | None:
         """The table in a file; None if the file is not as it was written, or with another key."""
         with suppress(OSError), self.open(name) as file:
             digest, _, body = file.read().partition(b" ")
             if digest == _blake2b(body, key=key).hexdigest().encode():
-                return json.loads(body)
+                content: Table = json.loads(body)
+                return content
         return None
 
     def _digest(self, name: str, *, synchronised: bool = False) -> str:
@@ -339,7 +340,7 @@ def run_to_file(
         resumed = len(folder.records())
         results = compute(folder)
         atomic.make_folder(path.parent)
-        manifest = stack_manifest(header, folder.records(), **results)
+        manifest = stack_manifest({**header, **results}, folder.records())
         with atomic.whole_file(path) as part:
             manifest.save(part)
             write(folder)

@@ -1,9 +1,7 @@
 """Restoration of the frames of one window, with a check of each frame and a verdict; also frame by frame (follow)."""
 
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -52,7 +50,7 @@ def restore_trusted(
     frames: Tensor,
     timing: SensorTiming,
     motion: Motion | DetectedVibration,
-    options: Mapping[str, Any],
+    options: RestorationOptions,
     *,
     force: bool = False,
     first_frames: int | None = None,
@@ -66,12 +64,11 @@ def restore_trusted(
     """
     vibration, left_alone = vibration_to_undo(motion, timing, len(frames), frames.shape[int(timing.scan_axis)])
     frames = frames if first_frames is None else frames[:first_frames]
-    chosen = RestorationOptions(**options)
-    joint, scale, optics = chosen.joint, chosen.scale, check_optics(chosen.optics)
-    prepared = prepare_frames(frames, timing, saturation=chosen.saturation, mosaic=chosen.mosaic)
+    joint, scale, optics = options.joint, options.scale, check_optics(options.optics)
+    prepared = prepare_frames(frames, timing, saturation=options.saturation, mosaic=options.mosaic)
     if not bool(vibration.moving_axes().any()):
         return RestoredFrames(unchanged_frames(prepared, joint, scale), False, left_alone, None, False)
-    restored = restore_prepared(prepared, vibration, chosen)
+    restored = restore_prepared(prepared, vibration, options)
     verdict = None
     with suppress(TooLittleInCommonError):
         if len(frames) > 1:
@@ -151,14 +148,13 @@ def restore_followed(
     frames: Tensor,
     timing: SensorTiming,
     followed: FollowedVibration,
-    options: Mapping[str, Any],
+    options: RestorationOptions,
     *,
     force: bool = False,
 ) -> RestoredFrames:
     """``restore_trusted`` of frames that each have their own vibration."""
-    chosen = RestorationOptions(**options)
-    prepared = prepare_frames(frames, timing, saturation=chosen.saturation)
-    restored, undone, left_alone = restore_each(prepared, followed, chosen)
+    prepared = prepare_frames(frames, timing, saturation=options.saturation)
+    restored, undone, left_alone = restore_each(prepared, followed, options)
     moving = undone.moving_axes().any(-1).tolist()
     # Two neighbouring frames near the middle are judged.
     verdict, starts = None, timing.frame_starts(len(moving)).tolist()
@@ -166,7 +162,7 @@ def restore_followed(
     if pairs:
         first = min(pairs, key=lambda index: abs(2 * index + 2 - len(moving)))
         interval = starts[first + 1] - starts[first]
-        verdict = pair_verdict(frames[first : first + 2], timing, undone[first], interval, chosen)
+        verdict = pair_verdict(frames[first : first + 2], timing, undone[first], interval, options)
     keep = any(moving) and (verdict is None or verdict.overall != "worse" or force)
     result = prepared.from_row_order(restored) if keep else frames
     unchanged = tuple(index for index, moves in enumerate(moving) if not (moves and keep))

@@ -3,12 +3,12 @@
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 
 from rsvib_torch.checks.values import check_whole_number
-from rsvib_torch.detection import DetectionResult
+from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration import RestorationVerdict
@@ -100,23 +100,20 @@ class WindowRecord:
     followed: tuple[int, ...] | None = None
     restored_frames: int | None = None
 
-    @classmethod
-    def of(
-        cls,
-        verdict: RestorationVerdict | None,
-        bad_frames: Mapping[int, str],
-        detection: DetectionResult | DetectedVibration | None,
-        *,
-        restored: bool,
-        **known: Any,
-    ) -> "WindowRecord":
-        """A record from a verdict, a detection and the other fields."""
-        return cls(
-            **known,
-            frames="restored" if restored else "as taken",
-            detection=None if detection is None else DetectedVibration.of(detection).to("cpu"),
-            outcome=None if verdict is None else verdict.overall,
-            summary=None if verdict is None else verdict.sentence,
-            predicted_gain=None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),
-            bad_frames={str(index): reason for index, reason in bad_frames.items()},
-        )
+
+def record_fields(
+    verdict: RestorationVerdict | None,
+    bad_frames: Mapping[int, str],
+    detection: DetectedVibration | None,
+    *,
+    restored: bool,
+) -> Table:
+    """Fields of a record from a verdict and a detection."""
+    return {
+        "frames": "restored" if restored else "as taken",
+        "detection": None if detection is None else DetectedVibration.of(detection).to("cpu"),
+        "outcome": None if verdict is None else verdict.overall,
+        "summary": None if verdict is None else verdict.sentence,
+        "predicted_gain": None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),
+        "bad_frames": {str(index): reason for index, reason in bad_frames.items()},
+    }

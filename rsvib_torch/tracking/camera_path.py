@@ -201,8 +201,7 @@ def _wave_columns(waves: NDArray[np.complex128], values: Array) -> Array:
 
 def _robust_weights(distance: Array, std: Array | float) -> Array:
     """Weights of residuals of the size ``distance`` with standard deviations, which are at least 0.001 px."""
-    weights: Array = 1.0 / (1.0 + (distance / (_SOFT * np.maximum(std, 1e-3))) ** 2) ** 2
-    return weights
+    return 1.0 / (1.0 + (distance / (_SOFT * np.maximum(std, 1e-3))) ** 2) ** 2
 
 
 @cache

@@ -228,8 +228,7 @@ class ToneFilter:
             robust = weights * share
         freedom = (share * (weights > 0)).sum(-1, keepdims=True) - columns.shape[-1]
         variance = (share * np.square(apart)).sum(-1, keepdims=True) / np.maximum(freedom, 1.0)
-        scaled: Array = robust / np.maximum(variance, 1e-12)
-        return scaled
+        return robust / np.maximum(variance, 1e-12)
 
     # Results
 
@@ -259,8 +258,7 @@ class ToneFilter:
 
     def growth(self) -> Array:
         """(A, K) 1/s, growth of the tones, the mean of all filters."""
-        mean: Array = (self.probability[..., None] * self.rates.real).sum(1)
-        return mean
+        return (self.probability[..., None] * self.rates.real).sum(1)
 
     def as_fit(self, origin: float) -> ToneFit:
         """The mean of all filters as a fit whose time origin is ``origin`` in s; the growth is left out."""

@@ -6,7 +6,7 @@ from contextlib import contextmanager, suppress
 from functools import cached_property
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import TYPE_CHECKING, BinaryIO, Protocol
 
 import cv2
 import numpy as np
@@ -16,6 +16,9 @@ from rsvib_torch.checks.values import needed_package
 from rsvib_torch.files.atomic import sync
 from rsvib_torch.io.stack_info import H264, StackInfo
 from rsvib_torch.io.video import CONTAINERS, VideoEncoder, check_video
+
+if TYPE_CHECKING:
+    from av.container import OutputContainer
 
 Frame = NDArray[np.uint8]  # (H, W) grey or (H, W, 3) RGB
 
@@ -72,7 +75,7 @@ class VideoOutput:
             raise ValueError(f"{path}: a live video is written to .mp4, .mov, .m4v or .mkv; or to a pipe with --out -")
         self._av = needed_package("av", "writing video", "video")
         self._path, self._rate, self._overwrite = path, frame_rate, overwrite
-        self._container: Any = None
+        self._container: OutputContainer | None = None
 
     def write(self, frame: Frame, index: int) -> None:
         """Encode a frame; after an error, the file has the frames before."""
@@ -105,7 +108,8 @@ class VideoOutput:
             yield
         except self._av.error.FFmpegError as error:
             with suppress(self._av.error.FFmpegError):
-                self._container.close()
+                if self._container is not None:
+                    self._container.close()
             self._container = None  # libav would crash if more was written after a header that could not be written
             raise OSError(f"{self._path}: {error.strerror}; the video has the frames before") from error
 
@@ -166,7 +170,7 @@ class PageOutput:
                 with suppress(OSError):  # the browser has left
                     self.wfile.write(data)
 
-            def log_message(self, *_: Any) -> None:
+            def log_message(self, *_: object) -> None:
                 """Requests are not printed."""
 
         try:

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import torch
@@ -129,7 +128,7 @@ def _signals_stop(reader: FrameReader) -> Iterator[Callable[[], None]]:
 
     ``_LONGEST_END`` later the main thread is interrupted, unless the function that this yields was called before.
     """
-    before: dict[signal.Signals, Any] = {}  # the handlers that are replaced
+    before: dict[signal.Signals, Callable[..., object] | int | None] = {}  # the handlers that are replaced
 
     def stop(*_: object) -> None:
         reader.stop()

@@ -55,8 +55,7 @@ def steady_shifts(
     # 3. Between two levels, their mean.
     first = np.minimum(needed.astype(int), len(levels) - 2)
     share, stacked, every = (needed - first)[:, None], np.stack(levels), np.arange(len(times))
-    mixed: Array = (1 - share) * stacked[first, every] + share * stacked[first + 1, every]
-    return mixed
+    return (1 - share) * stacked[first, every] + share * stacked[first + 1, every]
 
 
 def _local_lines(times: Array, apart: Callable[[int, slice], Array], duration: float, cuts: Sequence[int]) -> Array:

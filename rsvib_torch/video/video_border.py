@@ -70,8 +70,7 @@ class Margins:
                 "border='hold', or a shorter --steady"
             )
         rows, columns = rows - rows % 2, columns - columns % 2
-        part: Pixels = images[..., self.top : self.top + rows, self.left : self.left + columns]
-        return part
+        return images[..., self.top : self.top + rows, self.left : self.left + columns]
 
 
 class VideoBorder:

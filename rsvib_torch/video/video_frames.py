@@ -6,7 +6,6 @@ column.
 
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any
 
 import cv2
 import numpy as np
@@ -226,7 +225,7 @@ def _lanczos_taps(positions: Array) -> tuple[NDArray[np.int64], NDArray[np.float
     return cell.astype(np.int64) + 1 - _LOBES, (weights / weights.sum(1, keepdims=True)).astype(np.float32)
 
 
-def _as_counts(values: Frame, dtype: np.dtype[Any]) -> Frame:
+def _as_counts(values: Frame, dtype: np.dtype) -> Frame:
     """Interpolated values, rounded in place if they are counts."""
     if values.dtype != dtype and dtype.kind in "iu":
         limits = np.iinfo(dtype)

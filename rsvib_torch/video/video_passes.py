@@ -17,7 +17,7 @@ from rsvib_torch.detection.tones.fit import MotionModel, ToneFit
 from rsvib_torch.execution.parallel import ONE_BLAS_THREAD, prefetched
 from rsvib_torch.gyroscope.corner_tracks import followed_pair, tracks_of_pairs
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
-from rsvib_torch.gyroscope.rotation_alignment import RotationAlignment, align_rates
+from rsvib_torch.gyroscope.rotation_alignment import AlignOptions, RotationAlignment, align_rates
 from rsvib_torch.io.full_scale import counts_to_frames
 from rsvib_torch.io.video import VideoReader
 from rsvib_torch.motion.camera import Camera
@@ -34,7 +34,7 @@ from rsvib_torch.results.reason import Reason
 from rsvib_torch.stacks.job import stored_frame
 from rsvib_torch.stacks.recorded_motion import compared_pairs
 from rsvib_torch.stacks.window_restoration import pair_verdict
-from rsvib_torch.stacks.windows import WindowRecord
+from rsvib_torch.stacks.windows import WindowRecord, record_fields
 from rsvib_torch.tracking.camera_path import (
     SIGNIFICANT,
     WINDOW_FRAMES,
@@ -133,7 +133,7 @@ class VideoPasses:
         for _ in found.pairs(progress):  # for ``found.compared``, and for ``found.corners``
             pass
         tracks = tracks_of_pairs(found.compared, self.starts, timing, self.frames.size)
-        aligned = align_rates(tracks, timing, self.rates, self.camera)
+        aligned = align_rates(tracks, timing, self.rates, AlignOptions(camera=self.camera))
         if not aligned.reliable:
             source, reasons = self.rates.source, "; ".join(aligned.reasons)
             raise ValueError(f"the gyroscope ({source}) does not fit the video: {reasons}")
@@ -269,11 +269,10 @@ class VideoPasses:
                 )
                 if not sizes.any()
             ]
-        return WindowRecord.of(
-            verdict,
-            {track.index: track.fault for track in tracks if track.fault is not None},
-            detection,
-            restored=any(bool(track.motion.moving_axes().any()) for track in tracks if track.fault is None),
+        faults = {track.index: track.fault for track in tracks if track.fault is not None}
+        moved = any(bool(track.motion.moving_axes().any()) for track in tracks if track.fault is None)
+        return WindowRecord(
+            **record_fields(verdict, faults, detection, restored=moved),
             window=part,
             first=tracks[0].index,
             last=tracks[-1].index,

@@ -15,7 +15,7 @@ from rotating_camera import BIAS, COUNT, FOCAL_LENGTH, OFFSET, TIMING, attitude,
 
 import rsvib_torch as rsv
 from rsvib_torch.gyroscope.corner_tracks import CornerTracks, corner_tracks
-from rsvib_torch.gyroscope.rotation_alignment import align_rates
+from rsvib_torch.gyroscope.rotation_alignment import AlignOptions, align_rates
 from rsvib_torch.gyroscope.rotation_search import ORIENTATIONS, search_orientations
 from rsvib_torch.results.reason import Reason
 
@@ -33,7 +33,7 @@ def make_tracks(frames):
 
 def aligned(tracks, rates, camera=None):
     """``align_motion`` of frames whose corners were followed before."""
-    return align_rates(tracks, TIMING, rates, camera)
+    return align_rates(tracks, TIMING, rates, AlignOptions(camera=camera))
 
 
 def check(found, orientation, *, limit=4.0):
@@ -198,7 +198,8 @@ def test_recording_of_another_motion_is_refused(tracks):
 
 def test_offset_outside_the_given_ones_is_refused(tracks):
     limits = (OFFSET + 0.004, OFFSET + 0.01)
-    found = align_rates(tracks, TIMING, recorded(), rsv.Camera(FOCAL_LENGTH), offsets=limits)
+    options = AlignOptions(camera=rsv.Camera(FOCAL_LENGTH), offsets=limits)
+    found = align_rates(tracks, TIMING, recorded(), options)
     assert "offset_outside" in {reason.code for reason in found.findings}
 
 
@@ -266,7 +267,9 @@ def test_translation_of_the_camera_is_no_bias():
     tables = (torch.from_numpy(values) for values in (pair, cell, rows, place, offsets))
     starts = timing.frame_period * torch.arange(pairs + 1, dtype=torch.float64).unfold(0, 2, 1)
     tracks = CornerTracks(*tables, starts=starts, size=(480, 640), exposure_time=timing.exposure_time)
-    found = align_rates(tracks, replace(timing, row_time=4.5e-5), recorded(axes, 3.0, count=22), fit_row_time=True)
+    found = align_rates(
+        tracks, replace(timing, row_time=4.5e-5), recorded(axes, 3.0, count=22), AlignOptions(fit_row_time=True)
+    )
     assert found.reliable, found.reasons
     assert found.orientation == axes
     assert abs(found.offset - OFFSET) < min(4 * found.offset_std, 3e-4)

@@ -12,6 +12,7 @@ from truth import Motion, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
 from rsvib_torch.io import open_stack, write_stack
+from rsvib_torch.options import RestorationOptions
 from rsvib_torch.stacks import cut_windows, detect_stack, read_manifest, restore_trusted
 from rsvib_torch.stacks.memory import parse_memory
 
@@ -224,7 +225,7 @@ def test_motions_are_undone_and_unchanged_frames_have_the_shape_of_restored_ones
         (opposite, True, True, "worse"),
         (rsv.Vibration.still(), True, False, None),
     ):
-        found = restore_trusted(frames, timing, given, options, force=force)
+        found = restore_trusted(frames, timing, given, RestorationOptions(**options), force=force)
         assert found.restored == restored
         assert (None if found.verdict is None else found.verdict.overall) == outcome
         assert found.frames.shape == taken.shape

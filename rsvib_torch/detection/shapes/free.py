@@ -11,7 +11,6 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -52,7 +51,7 @@ from rsvib_torch.numerics.splines import gauss_legendre, spline_taps
 from rsvib_torch.numerics.tables import Array, split_axis, table, tensor
 from rsvib_torch.options import FreeMotionOptions, RegistrationOptions
 from rsvib_torch.results.presentation import AXIS_NAMES, JudgedResult, axis_rows, verdict_table
-from rsvib_torch.results.reason import Reason
+from rsvib_torch.results.reason import Findings, Reason
 from rsvib_torch.text import measured_text
 
 MAX_BAND_ERROR = 0.1  # px; smaller differences between the offsets of row bands and a motion are errors of registration
@@ -117,7 +116,7 @@ class MotionDetection(
     unseen: Tensor
     unexplained: Tensor
     reliable: Tensor
-    findings: tuple[Any, ...]
+    findings: Findings
 
     def summary(self) -> str:
         """Size of the motion of each axis with its standard deviations, and the verdict."""

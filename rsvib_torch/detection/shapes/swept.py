@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -41,7 +40,7 @@ from rsvib_torch.numerics.splines import gauss_legendre
 from rsvib_torch.numerics.tables import Array, scaled_inverse, split_axis, table, tensor, unit_wave
 from rsvib_torch.options import SweptToneOptions
 from rsvib_torch.results.presentation import AXIS_NAMES, JudgedResult, axis_rows, verdict_lines, verdict_table
-from rsvib_torch.results.reason import Reason
+from rsvib_torch.results.reason import Findings, Reason
 from rsvib_torch.text import measured_text, text_table
 
 # Of 24 simulated tones in two frames, 10 were found more than 6 standard deviations from the truth (a steady tone of
@@ -111,7 +110,7 @@ class SweptTone(
     motion: FreeMotion
     unexplained: Tensor
     reliable: Tensor
-    findings: tuple[Any, ...]
+    findings: Findings
 
     def __post_init__(self) -> None:
         super().__post_init__()

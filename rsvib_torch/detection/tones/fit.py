@@ -8,13 +8,13 @@ coupling of the scan with motion along it are part of the model, and all tones o
 import math
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 import torch
 from scipy.linalg import block_diag
 
 from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.numerics.tables import Array, cos_sin, select_stacks, split_axis, tensor, unit_wave, without_nan
 
@@ -553,7 +553,7 @@ def with_tones(fit: ToneFit, count: int) -> ToneFit:
     """The fit with room for ``count`` tones on each axis; the further ones do not exist."""
     further = ((0, 0), (0, 0), (0, count - fit.active.shape[-1]))
     names = ("coefficients", "frequencies", "active")
-    extended: dict[str, Any] = {name: np.pad(getattr(fit, name), further) for name in names}
+    extended: Table = {name: np.pad(getattr(fit, name), further) for name in names}
     return replace(fit, **extended, covariance=covariance_with_tones(fit.covariance, fit, count))
 
 
@@ -570,7 +570,7 @@ def with_axes(fit: ToneFit, axes: int) -> ToneFit:
     fit = strongest_only(fit)
     further = ((0, 0), (0, axes - fit.active.shape[1]), (0, 0))
     names = ("coefficients", "frequencies", "active", "drift")
-    extended: dict[str, Any] = {name: np.pad(getattr(fit, name), further) for name in names}
+    extended: Table = {name: np.pad(getattr(fit, name), further) for name in names}
     return replace(fit, **extended, covariance=fit.covariance[:, :0, :0])
 
 

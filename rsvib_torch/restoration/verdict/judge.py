@@ -8,6 +8,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -286,7 +287,7 @@ def _judged_strip(frames: ComparedFrames) -> ComparedFrames:
     starts, height = tuple(motion.frame_starts.tolist()), motion.num_rows
     of_strips = ColumnMotion(motion.vibration, columns, starts, motion.timing.row_time, height)
     of_frames = frame_motion(of_strips, motion.timing, motion.frame_starts, height)
-    return frames.mapped(lambda values: cut_columns(values, parts), motion=of_frames)
+    return replace(frames.mapped(lambda values: cut_columns(values, parts)), motion=of_frames)
 
 
 def judge_prepared(

@@ -45,7 +45,7 @@ class ComparedFrames(MovingFrames):
         def chosen(values: Tensor) -> Tensor:
             return values[stacks] if values.shape[1] < count else values[stacks][:, members]
 
-        return self.mapped(chosen, motion=self.motion.of(stacks, frames))
+        return replace(self.mapped(chosen), motion=self.motion.of(stacks, frames))
 
     @cached_property
     def moved(self) -> Tensor:
