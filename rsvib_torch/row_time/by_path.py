@@ -34,6 +34,9 @@ _SYSTEMATIC = 0.02
 # 1.03 of a drone, whose row time was 44 to 76 us in parts of its flight. Where tones are found beside the path, 16
 # recordings of tones alone have 1.04 to 2.5, and wrong row times; 9 of a hand 70 to 1000
 _MIN_CONTRAST, _MIN_CONTRAST_BESIDE_TONES = 1.15, 4.0
+# Tones of each axis that a path is compared with, cycles per frame above which they are fast, and the part of the
+# variance of the steps of the path that is left beside them by a hand at least
+_TONES, _SLOW, _NOT_TONES = 2, 0.1, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +108,8 @@ def row_time_of_path(stack: GreyFrames, clock: CameraClock) -> RowTimeFit | None
         return None
     window = followed.window(found[0])
     contrast = followed.squares(0.0, ())[0].mean() / followed.squares(found[0], ())[0].mean()
-    if contrast < (_MIN_CONTRAST_BESIDE_TONES if window.tones else _MIN_CONTRAST):
+    least = _MIN_CONTRAST_BESIDE_TONES if window.tones else _MIN_CONTRAST
+    if contrast < least or _may_be_tones(window, clock.period):
         return None
     if window.tones:
         found = followed.minimum(found[0], [(tone.axis, tone.frequency) for tone in window.tones])
@@ -116,6 +120,27 @@ def row_time_of_path(stack: GreyFrames, clock: CameraClock) -> RowTimeFit | None
     if abs(nearest - row_time) > 2.0 * std:
         return None
     return RowTimeFit(nearest, std, permitted=MAX_PATH_STD)
+
+
+def _may_be_tones(window: WindowPath, period: float) -> bool:
+    """Whether a path may be fast tones, which continue from frame to frame as other ones at another row time.
+
+    A tone of 49.5 Hz at 30 frames per second and 40 us continues as one of 19.5 Hz at 101.5 us. Slow motion would
+    continue as a fast tone at a row time below the limits only.
+    """
+    count = int(2 * (window.origin - window.start) / period)
+    path = np.diff(window.path(window.start + period * np.arange(count))[:, :2], axis=0)  # steps from frame to frame
+    total = path - path.mean(0)
+    waves = np.exp(2j * math.pi * np.arange(_SLOW, 0.5, 0.2 / count) * np.arange(count - 1)[:, None])
+    rest = total.copy()
+    for axis in range(2):
+        columns = [np.ones(count - 1)]
+        for _ in range(_TONES):
+            best = waves[:, np.argmax(np.abs(waves.T @ rest[:, axis]))]
+            columns += [best.real, best.imag]
+            design = np.stack(columns, -1)
+            rest[:, axis] = total[:, axis] - design @ np.linalg.lstsq(design, total[:, axis])[0]
+    return bool(np.square(rest).sum() < _NOT_TONES * np.square(total).sum())
 
 
 def _followed(stack: GreyFrames, clock: CameraClock) -> _FollowedCorners | None:

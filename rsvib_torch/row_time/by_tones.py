@@ -9,7 +9,6 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -37,20 +36,18 @@ from rsvib_torch.detection.tones.uncertainty import linearised
 from rsvib_torch.detection.verdict import residual_reasons, with_remedy
 from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.timing import RowTiming
-from rsvib_torch.numerics.tables import Array, median, scaled_inverse, table, tensor
+from rsvib_torch.numerics.tables import Array, scaled_inverse, table, tensor
 from rsvib_torch.options import MAX_TONES, RegistrationOptions
-from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
 
 MAX_CHI_SQUARE = 30.0  # above that of the best row time, for another one that explains the frames as well
-LARGEST_STEP = 0.02  # of the row time, in an iteration
+_LARGEST_STEP = 0.02  # of the row time, in an iteration
 MIN_SHARE = 0.2  # of the residual sum of squares that a further tone must explain
 MAX_STARTS = 5  # row times that are tried; of 8 random pairs of tones, 2 need a second
 # Chi-square of the frequencies of tones per row and per frame at a row time. Of 78 recordings whose row time was within
 # the limits, at most 5.5 for the bands and 8.9 for the rows; of 5 with a wrong result within wrong limits, 32 and more
 _MAX_CONTRADICTION = 20.0
-_NOT_A_TONE = 0.1  # of the variance of the steps from frame to frame, which other motions leave beside one tone
 
 
 @dataclass(frozen=True)
@@ -107,34 +104,10 @@ class FramePlaces:
         middle = 0.5 * (self.frames.min() + self.frames.max())
         return replace(self, rows=self.rows - 0.5 * (num_rows - 1), frames=self.frames - middle)
 
-    def of_first_frames(self, count: int) -> "FramePlaces":
-        """The rows that were measured in the first frames only."""
-        rows = (self.frames[0] - self.frames.min()).max(-1) < max(count, 1 + np.ptp(self.frames[0, 0]))
-        measured = self.measurements.of_rows(slice(0, int(rows.argmin()) or None))
-        number = measured.visible.shape[1]
-        return replace(self, measurements=measured, rows=self.rows[:, :number], frames=self.frames[:, :number])
-
     def values(self, axis: int) -> tuple[Array, Array]:
         """(N, G) px, displacements along an axis less their mean over the frames, and (N, 1) px^-1, their weights."""
         measured = self.measurements
         return measured.displacements[0, ..., axis], np.sqrt(measured.inverse_variances[0, :, axis])[:, None]
-
-
-def refined(
-    evaluate: Callable[[float], tuple[Candidate, float]], row_time: float, low: float, high: float
-) -> Candidate:
-    """Gauss-Newton on a row time in s, whose size is at least ``low`` and at most ``high``.
-
-    ``evaluate`` gives the fit of all other parameters at a row time, and the step in s.
-    """
-    size, sign = abs(row_time), math.copysign(1.0, row_time)
-    for _ in range(12):
-        found, step = evaluate(sign * size)
-        change = min(max(sign * step, -LARGEST_STEP * size), LARGEST_STEP * size)
-        size = min(max(size + change, low), high)
-        if abs(change) < 1e-2 * found.std:
-            break
-    return evaluate(sign * size)[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,10 +277,8 @@ def turned(stack: GreyFrames, direction: float) -> GreyFrames:
     return replace(stack, images=stack.images.flip(-2), valid=None if stack.valid is None else stack.valid.flip(-2))
 
 
-def bands_of_frames(
-    stack: GreyFrames, clock: CameraClock, options: RegistrationOptions
-) -> tuple[OffsetCurve, FramePlaces]:
-    """Offsets of the row bands of one stack, and their frame rows; they do not depend on the row time."""
+def bands_of_frames(stack: GreyFrames, clock: CameraClock, options: RegistrationOptions) -> FramePlaces:
+    """Offsets of the row bands of one stack with their frame rows; they do not depend on the row time."""
     timing = clock.timing(clock.high)
     curve = band_curve(stack.images, stack.valid, timing, options, mere_start=True)
     pairs, count = curve.quality.shape[1:]
@@ -315,27 +286,7 @@ def bands_of_frames(
     frames = curve.pairs[:, None].expand(pairs, count, 2).flatten(0, 1)
     measured = measurements_of_curve(curve, timing, options.band_step)
     of_rows, of_frames = table(rows.flatten(0, 1))[None], table(frames.double())[None]
-    places = FramePlaces(measured, of_rows, of_frames, clock.period, clock.high)
-    return curve, places
-
-
-def is_tone(curve: OffsetCurve) -> bool:
-    """Whether one tone on each axis may be the motion, by its steps from frame to frame; then it has other row times.
-
-    A tone above half of the frame rate continues from frame to frame as a slower one at another row time: one of 49.5
-    Hz at 30 frames per second and 40 us as one of 19.5 Hz at 101.5 us.
-    """
-    offsets = table(curve.offsets[0, ..., :2])
-    steps = np.nan_to_num(median(offsets, 1))
-    total = steps - steps.mean(0)
-    count = len(steps)
-    waves = np.exp(2j * math.pi * np.arange(0.02, 0.5, 0.2 / count) * np.arange(count)[:, None])
-    rest = total.copy()
-    for axis in range(2):
-        best = waves[:, np.argmax(np.abs(waves.T @ total[:, axis]))]
-        design = np.stack([np.ones(count), best.real, best.imag], -1)
-        rest[:, axis] -= design @ np.linalg.lstsq(design, total[:, axis])[0]
-    return bool(np.square(rest).sum() < _NOT_A_TONE * np.square(total).sum())
+    return FramePlaces(measured, of_rows, of_frames, clock.period, clock.high)
 
 
 def row_time_of_tones(
@@ -460,8 +411,8 @@ def _fit_row_time(places: FramePlaces, row_time: float, fit: ToneFit) -> tuple[f
     """Row time in s, its standard deviation, and the tones, by Gauss-Newton with all tones fitted in every step."""
     exposure = places.measurements.exposure_time
 
-    def evaluate(row_time: float) -> tuple[Candidate, float]:
-        nonlocal fit
+    change = std = math.inf
+    for _ in range(12):
         measured = places.timed(row_time)
         fit = fit_tones(measured, fit.frequencies, fit.active, fit.model)
         # derivatives of the displacements by the row time: velocity times row
@@ -469,17 +420,17 @@ def _fit_row_time(places: FramePlaces, row_time: float, fit: ToneFit) -> tuple[f
         velocity = (motion.displacement(starts + exposure) - motion.displacement(starts)) / exposure
         by_row_time = measured.relative(table(velocity) * places.rows[..., None])[..., None]
         # the part of the change by the row time that no change of the tones cancels
-        information = step = cost = 0.0
+        information, step = 1e-300, 0.0
         for axis, problem in linearised(measured, fit):
             unexplained = problem.unexplained(by_row_time[:, :, :, axis], axis)[0][0, :, 0]
             information += float(np.square(unexplained).sum())
             step += float(unexplained @ problem.residual[0])
-            cost += float(np.square(problem.residual[0]).sum())
-        information = max(information, 1e-300)
-        return Candidate(row_time, information**-0.5, cost), step / information
-
-    found = refined(evaluate, row_time, 0.0, math.inf)
-    return found.row_time, found.std, fit
+        std = information**-0.5
+        if abs(change) < 1e-2 * std:
+            break
+        change = float(np.clip(step / information, -_LARGEST_STEP * row_time, _LARGEST_STEP * row_time))
+        row_time += change
+    return row_time, std, fit
 
 
 def _row_tones(places: FramePlaces, fit: ToneFit, axis: int, row_time: float, clock: CameraClock) -> RowTones:

@@ -71,7 +71,6 @@ BY_MOTION: dict[str, tuple[Any, Any, Any, Any]] = {  # amplitudes, frequencies, 
     "row time by motion: 83 and 67 Hz": (((3.1,), (2.2,)), ((83.0,), (67.0,)), None, None),
     "row time by motion: 10 and 17 Hz": (((3.1,), (2.2,)), ((10.0,), (17.0,)), None, None),
     "row time by motion: four tones": (((1.5, 0.5), (1.1, 0.4)), ((41.0, 133.0), (67.0, 185.0)), None, None),
-    "row time by motion: smooth motion": (None, np.tile(np.linspace(0.5, 24.0, 50), (2, 1)), (0.4, 1.3), None),
     "row time by motion: random tones": (None, None, None, None),
 }
 KINDS = (*TONES, *TURNS, TRACKED, *FOLLOWED, *FREE, *(f"row time: {kind}" for kind in CALIBRATIONS), *FIXED, *BY_MOTION)
@@ -284,9 +283,6 @@ def shake_of(kind: str, generator: Generator) -> Shake:
     if frequency is None:  # two random tones
         amplitude = generator.uniform(0.5, 4.0, (2, 1))
         frequency = log_uniform(generator, 8.0, 220.0, 2)[:, None]
-    elif amplitude is None:  # 3 px rms, bandwidth 6 Hz
-        power = np.exp(-0.5 * (frequency / 6.0) ** 2) * -np.log(generator.uniform(size=frequency.shape))
-        amplitude = 3.0 * np.sqrt(2 * power / power.sum(1, keepdims=True))
     phase = generator.uniform(-math.pi, math.pi, np.shape(amplitude))
     return Shake(np.array(amplitude), np.array(frequency), phase, np.zeros(2))
 

@@ -12,10 +12,7 @@ from truth import Motion, recorded
 
 import rsvib_torch as rsv
 from rsvib_torch.config import read_config
-from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.io.stack_info import StackInfo
-from rsvib_torch.row_time.by_motion import row_time_of_splines
-from rsvib_torch.row_time.by_tones import CameraClock, FramePlaces
 
 HEIGHT, WIDTH, FRAMES = 192, 144, 5
 ROW_TIME, FRAME_ROWS = 6e-5, 240
@@ -107,36 +104,6 @@ def test_what_is_not_identifiable_is_refused(two_tones, tmp_path, frames, code):
     loaded = rsv.RowTimeCalibration.load(tmp_path / "row_time.json")
     assert loaded.row_time is None
     assert loaded.findings == found.findings
-
-
-def smooth_motion(times, highest, seed):
-    generator = np.random.default_rng(seed)
-    frequency = np.linspace(0.5, highest, 60)
-    power = np.exp(-0.5 * (4 * frequency / highest) ** 2)
-    size = 3.0 * np.sqrt(2 * power / power.sum())
-    phase = generator.uniform(-np.pi, np.pi, (2, len(frequency)))
-    return (size * np.cos(2 * np.pi * frequency * times[..., None, None] + phase)).sum(-1)
-
-
-@pytest.mark.parametrize(("highest", "known"), [(30.0, True), (400.0, False)])
-def test_smooth_motion_continues_over_the_blanking_time(highest, known):
-    """Rows of 8 frames at 30 per second, 256 rows of 100 us; within the blanking time, 400 Hz repeat three times."""
-    period, row_time, noise = 1 / 30, 100e-6, 0.004
-    generator = np.random.default_rng(3)
-    rows = np.repeat(np.arange(4.0, 256.0, 8.0)[:, None], 8, axis=1)
-    frames = np.broadcast_to(np.arange(8.0), rows.shape)
-    values = smooth_motion(frames * period + rows * row_time, highest, 1)
-    values = values + noise * generator.standard_normal(values.shape)
-    values, rows, frames = (part[None] for part in (values, rows, frames))
-    information = np.broadcast_to(np.eye(2) / noise**2, (1, rows.shape[1], 2, 2))
-    measured = Measurements(rows * 0.0, values - values.mean(2, keepdims=True), np.ones_like(rows), information, 1e-4)
-    places = FramePlaces(measured, rows, frames, period, row_time)
-    found = row_time_of_splines(places, CameraClock(period, 256, 60e-6, period / 256, (1.0, -1.0), None))
-    assert (found is not None) == known
-    if found is not None:
-        fit, _ = found
-        assert not fit.others
-        assert abs(fit.row_time - row_time) < 4 * fit.std < 0.02 * row_time
 
 
 def test_command(two_tones, one_tone, tmp_path, capsys):
