@@ -80,7 +80,7 @@ def test_two_frames_are_refused():
 def test_other_minima_are_left():
     # from one start, the fit ended at 6.8 ± 0.3 Hz, 11.2 ± 0.6 px with a decay of 112 ± 3 /s
     swept = tone(1.7, 29.3, decay=16.9, chirp=461.0, phase=-0.4)
-    found = rsv.detect_swept_tone(taken(NEAR_BLIND, swept, 4, size=(192, 96)), NEAR_BLIND)
+    found = rsv.detect_swept_tone(taken(NEAR_BLIND, swept, 4, size=(192, 128)), NEAR_BLIND)
     assert found.reliable.all()
     assert agrees(found, times=5, share=0.0, amplitude=1.7, frequency=29.3, decay=16.9, chirp=461.0)
     assert (found.std["frequency"] < 1.5).all()
