@@ -43,6 +43,7 @@ _FINE = 64  # frequencies that are compared at a time
 _MIN_RATIO = 60.0  # of the variance that a tone explains and that of the rest; compression and parallax reach 40
 _MIN_EXPLAINED = 0.03  # px rms, of the offsets that a tone explains; smaller ones are not visible in a video
 _LOWEST = 0.6  # of the frame rate; the path follows slower motion
+_HIGHEST = 2000.0  # Hz; rows that are read nearly at once would resolve any frequency, and the search would not end
 _MIN_GAIN = 0.15  # |2 sin(pi f T)|; tones close to a multiple of the frame rate hardly change from frame to frame
 # Tones of at most this gain of which more is left in a third of the rows are left out: 0.1 to 0.8 of 20 of 24 tones by
 # objects that move in some rows, below 0.03 of tones of cameras at such frequencies
@@ -61,10 +62,15 @@ _DISTINCT = 1.08
 # 0.003 to 0.005 Hz, 2 to 4 standard deviations of noise
 _DRIFT = 0.012
 _ROUNDS = 4  # of a robust fit
-# Parts of the time of a readout, of a reversed one and of frames whose rows are all read at once, and by how much the
-# path leaves less with one of them if the stated readout is wrong: 8 and 4 times of hand-held clips, where tones of
-# 0.2 to 0.8 px were found that are none; at most 1.03 times of 11 other clips
-_OTHER_READOUTS, _CONTRADICTED = {"in reverse": -1.0, "all at once": 0.0}, 2.0
+# Parts of the time of a readout, and by how much the square of what the path leaves is less with one of them if the
+# stated readout is wrong. Eight clips of a hand with vibration in H.264, a phone and a drone: at most 1.00 with the
+# right row time, and 1.39 and more with 0.55, 0.73 and 1.6 times of it
+_OTHER_READOUTS = {
+    "in reverse": -1.0,
+    "all at once": 0.0,
+    **{f"in {part:g} times the time": part for part in (0.5, 0.7, 1.4, 2.0)},
+}
+_CONTRADICTED = 1.2
 _HALF, _FOUR_FIFTHS = 1.177, 1.794  # standard deviations, below which that part of lengths of two normal components is
 # Residual of the path of a layer over that of all corners, before tones are found: 0.07 to 0.63 beside a subject on 20
 # to 40 % of the frame, 0.98 to 2.3 in clips with tones of 1.5 to 5 px
@@ -168,6 +174,7 @@ class WindowPath:
     # how the rows are read instead, if the corners contradict the stated readout, and px, median residuals by the path
     # with the stated and with this readout
     other_readout: tuple[str, float, float] | None
+    is_of_other: bool  # whether the path is that with this readout, because its rows are displaced along another path
 
     def path(self, times: Array, derivative: int = 0) -> Array:
         """(N, 4) components of the path, or their derivatives, at times (N,) in s."""
@@ -376,6 +383,32 @@ class _WindowFit:
         other.solve(1)
         return other
 
+    def with_aliases(self, axis: int, frequency: float, slope: float, limits: Array) -> list["_WindowFit"]:
+        """The fit with a tone or one of its aliases between ``limits`` in Hz, the best first.
+
+        Frequencies one period per frame apart differ within the readout only, where the path follows a part of the
+        tone: they are compared by what remains of both axes.
+        """
+        aliases = frequency + np.arange(-_ALIASES, _ALIASES + 1) / self.interval
+        inside = (aliases > limits[0]) & (aliases < limits[1]) & self.is_apart(axis, aliases)
+        trials = [self.with_tone(axis, alias, slope) for alias in aliases[inside | (aliases == frequency)].tolist()]
+        return sorted(trials, key=lambda trial: trial.unexplained)
+
+    def with_distinct_tones(self, limits: Array) -> "_WindowFit | None":
+        """The fit with a better alias of a tone, or without a tone that an alias explains as well; None without both.
+
+        As long as other tones are not known, they hide which alias leaves less.
+        """
+        for tone in self.tones:
+            rest = copy(self)
+            rest.tones = [other for other in self.tones if other is not tone]
+            best, *others = rest.with_aliases(tone.axis, tone.frequency, tone.slope, limits)
+            if others and others[0].unexplained < _DISTINCT * best.unexplained:
+                return rest
+            if abs(best.tones[-1].frequency - tone.frequency) * self.interval > 0.5:
+                return best
+        return None
+
     def of_layer(self) -> "_WindowFit":
         """The path of the layer of the corners; this one, if it explains about as much of all corners.
 
@@ -512,6 +545,30 @@ def distances_left(
     return fit.distance
 
 
+def _with_other_readout(fit: _WindowFit, readout: float) -> tuple[tuple[str, float, float] | None, _WindowFit]:
+    """``WindowPath.other_readout``, and the fit: that with the other readout where it has another path.
+
+    At another readout, a tone continues from frame to frame as its alias with the same phase within a frame.
+    """
+    found, limit, best = None, fit.unexplained / _CONTRADICTED, fit
+    for name, part in _OTHER_READOUTS.items():
+        moved = (1.0 - part) * readout * (fit.corners.rows - 0.5)
+        times = fit.corners.times - moved[:, None]
+        other = _WindowFit(replace(fit.corners, times=times), fit.interval, fit.averaged)
+        if part > 0.0:
+            turns = (round((1.0 / part - 1.0) * tone.frequency * fit.interval) for tone in fit.tones)
+            aliases = {
+                (tone.axis, tone.frequency + turn / fit.interval) for tone, turn in zip(fit.tones, turns, strict=True)
+            }
+            other.add_tones(sorted(aliases))
+        other.solve(_ROUNDS)
+        if other.unexplained < limit:
+            # rows that are read the other way, or all at once, are displaced along another path
+            limit, best = other.unexplained, other if part <= 0.0 else fit
+            found = name, math.sqrt(fit.unexplained), math.sqrt(limit)
+    return found, best
+
+
 def fit_window(
     corners: Corners,
     interval: float,
@@ -527,21 +584,13 @@ def fit_window(
     """
     fit = _WindowFit(corners, interval, averaged)
     fit.solve(_ROUNDS)
-    # The readout that explains the corners best, before tones are found.
-    other_readout, limit = None, fit.unexplained / _CONTRADICTED
-    for name, part in _OTHER_READOUTS.items() if has_tones and len(slopes) == 1 else ():
-        moved = (1.0 - part) * readout * (corners.rows - 0.5)
-        other = _WindowFit(replace(corners, times=corners.times - moved[:, None]), interval, averaged)
-        other.solve(_ROUNDS)
-        if other.unexplained < limit:
-            limit = other.unexplained
-            other_readout = name, math.sqrt(fit.unexplained), math.sqrt(limit)
     fit = fit.of_layer()
     # Frequencies above those that the path follows, up to those that rows resolve, without blind ones.
     step = 0.3 / (fit.times.max() - fit.times.min())
-    frequencies = np.arange(_LOWEST / interval, 0.5 * _CELLS / readout, step)
+    frequencies = np.arange(_LOWEST / interval, min(0.5 * _CELLS / readout, _HIGHEST), step)
     is_resolved = np.abs(np.prod(np.sinc(frequencies[:, None] * np.array(averaged)), 1)) > _MIN_SINC
     is_visible = is_resolved & (_gain(frequencies, interval) > _MIN_GAIN)
+    limits = frequencies[is_visible][[0, -1]] if is_visible.any() else np.zeros(2)
     axes = [0, 1] if has_tones and is_visible.sum() > 2 else []
     # Strongest tones by axis and slope. A tone of one axis does not change those of the other.
     found: dict[tuple[int, float], tuple[float, float, float]] = {}
@@ -555,17 +604,8 @@ def fit_window(
         (axis, slope), (frequency, ratio, offsets) = max(found.items(), key=lambda item: item[1][1])
         if ratio < _MIN_RATIO or offsets < _MIN_EXPLAINED:
             break
-        # Frequencies one period per frame apart differ within the readout only, where the path follows a part of the
-        # tone: they are compared by what remains of both axes.
-        aliases = frequency + np.arange(-_ALIASES, _ALIASES + 1) / interval
-        inside = (aliases > frequencies[is_visible][0]) & (aliases < frequencies[is_visible][-1])
-        trials = [fit.with_tone(axis, float(alias), slope) for alias in aliases[inside & fit.is_apart(axis, aliases)]]
-        best, *others = sorted(trials, key=lambda trial: trial.unexplained)
+        best, *_ = fit.with_aliases(axis, frequency, slope, limits)
         found = {of: value for of, value in found.items() if of[0] != axis}
-        # the path decides between the aliases only if the best of them leaves clearly less; otherwise none is stated
-        if others and others[0].unexplained < _DISTINCT * best.unexplained:
-            left_out[axis] |= np.any([~fit.is_apart_from(alias, frequencies) for alias in aliases], axis=0)
-            continue
         best.solve()
         if best.has_blind_tone():
             # A part of the picture that moves by itself displaces the same rows again and again: without vibration, it
@@ -575,18 +615,25 @@ def fit_window(
             continue
         fit = best
         axes = [axis for axis in (0, 1) if sum(one.axis == axis for one in fit.tones) < _MOST_TONES]
-    # Tones that others explain in the end, or that are none of all rows.
+    # Tones that others explain in the end, that are none of all rows, or that are not told from their aliases.
     number = -1
-    while len(fit.tones) != number:
+    for _ in range(4 * _MOST_TONES):
+        if len(fit.tones) == number:
+            break
         number = len(fit.tones)
         fit.solve()
         fit.keep_tones()
+        changed = fit.with_distinct_tones(limits)
+        if changed is not None:
+            fit, number = changed, -1
+    other_readout, best = (None, fit) if not has_tones or len(slopes) > 1 else _with_other_readout(fit, readout)
+    is_of_other, fit = best is not fit, best
     knots = fit.knots.T / np.array([1.0, 1.0, fit.reach, fit.reach])
     residual = residual_of_most = float(np.median(fit.distance)) / _HALF
     if not fit.layer.all():  # with a subject on 40 % of the frame, tones of 0.1 px were found that are none
         residual_of_most = float(np.quantile(fit.distance, 0.8)) / _FOUR_FIFTHS
     return WindowPath(
-        fit.origin, fit.start, fit.step, knots, tuple(fit.tones), residual, residual_of_most, other_readout
+        fit.origin, fit.start, fit.step, knots, tuple(fit.tones), residual, residual_of_most, other_readout, is_of_other
     )
 
 
@@ -596,6 +643,11 @@ class CameraPath:
 
     windows: tuple[WindowPath, ...]
     allowed: float  # px, residual of a window that is explained
+
+    @property
+    def displaces_rows(self) -> bool:
+        """Whether the rows are displaced along the path as their readout is stated."""
+        return 2 * sum(window.is_of_other for window in self.windows) < len(self.windows)
 
     def _weights(self, times: Array) -> Array:
         """(W, N) weights of the windows at times, which change linearly between the middles of neighbours."""
@@ -666,8 +718,10 @@ def camera_path(
             joined = Corners.joined(known)
             if not windows or joined.times.mean() > windows[-1].origin:
                 found.append(fit_window(joined, timing.frame_period, averaged, readout, slopes=_SLOPES))
-        share = 1.2 if continued else 0.5
-        return found if found and np.median([one.residual for one in found]) < share * window.residual else []
+        least = (1.2 if continued else 0.5) * window.residual
+        if window.other_readout is not None:  # tones that sweep explain less than the other readout does
+            least = min(least, window.other_readout[2] / _HALF)
+        return found if found and np.median([one.residual for one in found]) < least else []
 
     fitted = 0
     for pair in pairs:

@@ -124,7 +124,7 @@ class VideoPasses:
             places = path.places(found.taken)
             shift = self._to_steady(times, lambda number, others: places[others] - places[number], found.cuts)
             polynomials = np.stack([path.derivatives(found.taken, 1), path.derivatives(found.taken, 2), shift], 1)
-            polynomials[:, :2] *= not self.stabilised
+            polynomials[:, :2] *= path.displaces_rows and not self.stabilised
 
             def by_corners(index: int) -> Vibration:
                 return self._removed(path.tones(float(found.taken[index])), polynomials[index])
