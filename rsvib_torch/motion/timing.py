@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 import os
+import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -31,6 +32,10 @@ _MAX_BLANKING = 32  # row times per row; of more frames with so long a blanking 
 MAX_START_TIME = 1e10  # s; clocks that count from 1970 read 1.8e9 s, to 2e-7 s in float64
 _AGREEMENT = 1e-3  # relative; keys that state the same time twice are rounded by whoever wrote them
 _SCAN_AXES: dict[object, int] = {-2: -2, "y": -2, -1: -1, "x": -1}
+
+
+class TimingWarning(UserWarning):
+    """The frame rate or the times of frames contradict the timing of the sensor."""
 
 
 @dataclass(frozen=True)
@@ -253,15 +258,40 @@ class SensorTiming:
                 f"{self.frame_rate:g} frames/s, row_time is at most {self.frame_period / num_rows:.6g} s"
             )
 
+    def other_intervals(self, num_frames: int, num_rows: int) -> tuple[float, float] | None:
+        """Shortest and longest interval in s of frame start times that are not 1 to 3 frame periods apart, to 1 %.
+
+        Otherwise None, also for more missing frames between others, and for line sensors: frames of the latter have no
+        blanking rows, and start after delays.
+        """
+        if self.frame_start_times is None or num_frames < 2 or self.frame_rows <= num_rows:
+            return None
+        periods = self.frame_starts(num_frames).diff() / self.frame_period
+        whole = periods.round().clamp(min=1.0)
+        least, most = float(periods.min()), float(periods.max())
+        if least < 3.1 and bool(((periods - whole).abs() <= 0.01 * whole).all()):
+            return None
+        return least * self.frame_period, most * self.frame_period
+
     def check_span(self, num_frames: int, num_rows: int) -> None:
         """Raise a ``ValueError`` if frames are too far apart for their number of rows to resolve frequencies.
 
         The number of frequencies that are tried, and the time and memory that they take, grow with the span.
+        A ``TimingWarning`` states intervals between frames that are all far from the frame period.
         """
         check_whole_number("num_rows", num_rows, at_least=1)
         starts = self.frame_starts(num_frames)
         step, span = float(starts.diff().median()), float(starts[-1] - starts[0])
         if span <= self.row_time * max(MAX_SPAN, _MAX_BLANKING * num_frames * num_rows):
+            least, most = self.other_intervals(num_frames, num_rows) or (self.frame_period, self.frame_period)
+            if not 0.9 * least <= self.frame_period <= most / 0.9:
+                warnings.warn(
+                    f"frame_start_times are {step:.3g} s apart, but the frame period is {self.frame_period:.3g} s "
+                    f"(frame_rows={self.frame_rows:g} x row_time={self.row_time:g} s): wrong times give wrong "
+                    "frequencies; start times are seconds, correct them or frame_rows",
+                    TimingWarning,
+                    stacklevel=2,
+                )
             return
         units = {"ms": 1e3, "us": 1e6, "ns": 1e9}  # within a factor of two
         unit = next((name for name, size in units.items() if 0.5 < step / (size * self.frame_period) < 2), None)
