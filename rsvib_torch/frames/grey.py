@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.checks.arrays import FramesOrFiles
-from rsvib_torch.frames.mosaic import is_mosaic, mosaic_free
+from rsvib_torch.frames.mosaic import are_mosaics, mosaic_free
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.frames.pixels import cut_columns, detailed_parts
 from rsvib_torch.frames.prepare import prepare_frames
@@ -109,11 +109,9 @@ def grey_frames(
 
 def without_mosaic(images: Tensor) -> Tensor:
     """Grey frames (B, T, H, W), of colour mosaics without the pattern of the colours, which does not move."""
-    first = images[:, 0]
-    mosaic = is_mosaic(first, blocks=32, least=1.5)  # a part of the pixels is enough to exclude most frames
+    mosaic = are_mosaics(images[:, 0])
     if not bool(mosaic.any()):
         return images
-    mosaic &= is_mosaic(first)
     return torch.where(mosaic[:, None, None, None], mosaic_free(images), images)
 
 

@@ -60,6 +60,12 @@ def fill_by_colour(frames: Tensor, missing: Tensor) -> Tensor:
     return functional.pixel_shuffle(fill_with_means(functional.pixel_unshuffle(frames, 2), holes), 2)
 
 
+def are_mosaics(images: Tensor) -> Tensor:
+    """``is_mosaic`` of images of which few are: a part of the pixels is enough to exclude most others."""
+    mosaic = is_mosaic(images, blocks=32, least=1.5)
+    return mosaic & is_mosaic(images) if bool(mosaic.any()) else mosaic
+
+
 def is_mosaic(images: Tensor, *, blocks: int | None = None, least: float = 3.0) -> Tensor:
     """Whether images (B, H, W) are mosaics of colours: (B,) bool.
 

@@ -11,6 +11,7 @@ from truth import decibel, draw_scene
 
 import rsvib_torch as rsv
 from rsvib_torch.frames.mosaic import colour_frames, is_mosaic
+from rsvib_torch.restoration import RestorationWarning
 from rsvib_torch.restoration.exact.mosaic_scene import MosaicSolver
 from rsvib_torch.restoration.exact.scene_solver import Partition
 from rsvib_torch.restoration.frame_motion import frame_motion
@@ -66,6 +67,14 @@ def clean(scene):
 @pytest.fixture(scope="module")
 def frames(clean):
     return raw(clean)
+
+
+def test_a_mosaic_that_is_restored_as_grey_frames_causes_a_warning(clean, frames):
+    with pytest.warns(RestorationWarning, match='raw frames of a colour sensor.* e.g. mosaic="RGGB"'):
+        restored(frames, mosaic=None)
+    grey = noisy(clean[:, 0], NOISE)
+    without_warning(restored, grey, mosaic=None)
+    without_warning(restored, frames)
 
 
 def test_frames_together_contain_the_colours_that_each_lacks(scene, frames):
