@@ -258,20 +258,30 @@ class SensorTiming:
                 f"{self.frame_rate:g} frames/s, row_time is at most {self.frame_period / num_rows:.6g} s"
             )
 
-    def other_intervals(self, num_frames: int, num_rows: int) -> tuple[float, float] | None:
-        """Shortest and longest interval in s of frame start times that are not 1 to 3 frame periods apart, to 1 %.
+    def other_intervals(self, starts: Tensor, num_rows: int) -> tuple[float, float] | None:
+        """Shortest and longest interval in s between frames that are not 1 to 3 frame periods apart, to 1 %.
 
         Otherwise None, also for more missing frames between others, and for line sensors: frames of the latter have no
         blanking rows, and start after delays.
         """
-        if self.frame_start_times is None or num_frames < 2 or self.frame_rows <= num_rows:
+        if len(starts) < 2 or self.frame_rows <= num_rows:
             return None
-        periods = self.frame_starts(num_frames).diff() / self.frame_period
+        periods = starts.diff() / self.frame_period
         whole = periods.round().clamp(min=1.0)
-        least, most = float(periods.min()), float(periods.max())
-        if least < 3.1 and bool(((periods - whole).abs() <= 0.01 * whole).all()):
+        if float(periods.min()) < 3.1 and bool(((periods - whole).abs() <= 0.01 * whole).all()):
             return None
-        return least * self.frame_period, most * self.frame_period
+        return float(periods.min()) * self.frame_period, float(periods.max()) * self.frame_period
+
+    def contradiction(self, starts: Tensor, num_rows: int) -> str:
+        """Sentence about starts of frames whose intervals are all far from the frame period; empty if they are not."""
+        least, most = self.other_intervals(starts, num_rows) or (self.frame_period, self.frame_period)
+        if 0.9 * least <= self.frame_period <= most / 0.9:
+            return ""
+        return (
+            f"by their times, frames are {float(starts.diff().median()):.3g} s apart, but the frame period is "
+            f"{self.frame_period:.3g} s (frame_rows={self.frame_rows:g} x row_time={self.row_time:g} s): wrong times "
+            "give wrong frequencies; times are seconds, correct them or frame_rows"
+        )
 
     def check_span(self, num_frames: int, num_rows: int) -> None:
         """Raise a ``ValueError`` if frames are too far apart for their number of rows to resolve frequencies.
@@ -283,15 +293,8 @@ class SensorTiming:
         starts = self.frame_starts(num_frames)
         step, span = float(starts.diff().median()), float(starts[-1] - starts[0])
         if span <= self.row_time * max(MAX_SPAN, _MAX_BLANKING * num_frames * num_rows):
-            least, most = self.other_intervals(num_frames, num_rows) or (self.frame_period, self.frame_period)
-            if not 0.9 * least <= self.frame_period <= most / 0.9:
-                warnings.warn(
-                    f"frame_start_times are {step:.3g} s apart, but the frame period is {self.frame_period:.3g} s "
-                    f"(frame_rows={self.frame_rows:g} x row_time={self.row_time:g} s): wrong times give wrong "
-                    "frequencies; start times are seconds, correct them or frame_rows",
-                    TimingWarning,
-                    stacklevel=2,
-                )
+            if text := self.contradiction(starts, num_rows):
+                warnings.warn(text, TimingWarning, stacklevel=2)
             return
         units = {"ms": 1e3, "us": 1e6, "ns": 1e9}  # within a factor of two
         unit = next((name for name, size in units.items() if 0.5 < step / (size * self.frame_period) < 2), None)

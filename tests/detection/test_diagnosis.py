@@ -34,7 +34,7 @@ def frames():
 @pytest.mark.parametrize("seconds", [1.0, 0.085, 0.034])  # frame numbers, and other frame rates
 def test_frame_start_times_far_from_the_frame_period_cause_a_warning(frames, seconds):
     stated = replace(TIMING, frame_start_times=tuple(seconds * number for number in range(4)))
-    message = f"frame_start_times are {seconds:g} s apart, but the frame period is 0.0417 s"
+    message = f"by their times, frames are {seconds:g} s apart, but the frame period is 0.0417 s"
     with pytest.warns(TimingWarning, match=message):
         found = detect_vibration(frames, stated)
     assert any(f"frame_start_times {seconds:g} s apart" in text for text in found.assumptions)

@@ -42,8 +42,8 @@ class RestorationVerdict(
         predicted_gain: (P,) dB, improvement: estimated PSNR of the restored frames minus that of the raw ones. It is
             valid where the motion is right and complete, NaN where it is not and has the opposite sign of the outcome.
         outcome: For each pair: ``"helps"``; ``"partly"``: the vibration explains only a part of the displacement,
-            and restored frames may be better or worse; ``"worse"``; ``"unknown"``: cannot be determined from this pair (vibration too small, or at a blind
-            frequency; frames without contrast; too many missing pixels).
+            and restored frames may be better or worse; ``"worse"``; ``"unknown"``: cannot be determined from this pair
+            (vibration too small, or at a blind frequency; frames without contrast; too many missing pixels).
         findings: The ``Reason`` objects of each pair; none where restoration helps. ``reasons`` has their texts.
     """
 
