@@ -94,7 +94,8 @@ def grey_frames(
         valid = _unless_complete(valid | (around > _MEASURED_AROUND))
     # a frame without detail has no displacement
     for stack, frame in _constant(images).nonzero().tolist():
-        raise ValueError(constant_frame(f"{frame}{of_stack(stack)}"))
+        place, remedy = f"{frame}{of_stack(stack)}", "leave out this stack" if prepared.batched else "remove this frame"
+        raise ValueError(f"{constant_frame(place)}; {remedy}")
     # a copy of a frame was exposed at another time than its place in the stack states
     for stack, first in _repeated(images).nonzero().tolist():
         raise ValueError(
@@ -117,7 +118,7 @@ def without_mosaic(images: Tensor) -> Tensor:
 
 def constant_frame(place: int | str) -> str:
     """Message for a frame whose pixels are equal."""
-    return f"frame {place} is constant and cannot be registered; remove this frame"
+    return f"frame {place} is constant and cannot be registered"
 
 
 def _constant(frames: Tensor) -> Tensor:

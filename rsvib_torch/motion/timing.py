@@ -88,9 +88,9 @@ class SensorTiming:
         if row_time < MIN_ROW_TIME:
             raise ValueError(f"row_time={row_time:g} s is shorter than 1 ns; row_time is in seconds")
         if row_time > 10e-3:
+            us = row_time if row_time >= 1 else 1e3 * row_time  # a number of us, or of ms
             raise ValueError(
-                f"row_time={row_time:g} s is longer than 10 ms; row_time is in seconds "
-                f"({row_time:g} us is {row_time:g}e-6)"
+                f"row_time={row_time:g} s is longer than 10 ms; row_time is in seconds ({us:g} us is {us:g}e-6)"
             )
         exposure_rows = check_number("exposure_rows", self.exposure_rows, above=0.0)
         frame_rows = check_number("frame_rows", self.frame_rows, above=0.0)
