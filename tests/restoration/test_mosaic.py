@@ -173,12 +173,16 @@ def test_detection_in_raw_frames():
     frames = raw(clean)
     assert error(frames) < 0.02  # px; 0.06 without the filter
     grey = torch.from_numpy(clean.mean(1)).float()
+    sign = 1 - 2 * (torch.arange(128) % 2)
+    twice_green = grey * (1 + 0.1 * sign + 0.1 * sign[:, None])  # red and blue together
     for blocks in (None, 4):
         assert is_mosaic(frames, blocks=blocks).all()
+        assert is_mosaic(twice_green, blocks=blocks).all()
         assert not is_mosaic(grey, blocks=blocks).any()
     assert not is_mosaic(torch.randn(3, 64, 64, generator=torch.Generator().manual_seed(1))).any()
     column = torch.arange(128)[None, :].expand(128, -1)
     assert not is_mosaic(torch.sin(2.9 * column).float()[None])  # detail near 1/2 cycle per px
+    assert not is_mosaic(grey * (1 + 0.1 * sign)).any()  # columns that alternate
 
 
 def test_frames_that_do_not_fit_are_reported(frames):
