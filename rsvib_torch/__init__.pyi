@@ -43,7 +43,6 @@ from .imaging import SensorNoise as SensorNoise
 from .imaging import row_psf as row_psf
 from .imaging import simulate_frames as simulate_frames
 from .io import StackInfo as StackInfo
-from .io import TimingWarning as TimingWarning
 from .io import open_stack as open_stack
 from .io import read_stack as read_stack
 from .io import read_stack_info as read_stack_info
@@ -57,6 +56,7 @@ from .motion.detected_vibration import FollowedVibration as FollowedVibration
 from .motion.recorded import read_motion as read_motion
 from .motion.spline import FreeMotion as FreeMotion
 from .motion.timing import SensorTiming as SensorTiming
+from .motion.timing import TimingWarning as TimingWarning
 from .motion.vibration import Vibration as Vibration
 from .motion.vibration import VibrationStd as VibrationStd
 from .motion.vibration import blind_frequencies as blind_frequencies

@@ -76,7 +76,7 @@ def windows_answer(
 
 
 def warn_of_restoration(result: stacks.RestoredFrames, output: str = "frames") -> None:
-    """Print a warning if there is nothing to restore, or if restoration does not help or helps in part only."""
+    """Print a warning if there is nothing to restore, or if restoration does not help or may not."""
     kept = "the frames are written unchanged" if output == "frames" else "the page has the input frames only"
     forced = "writes" if output == "frames" else "shows"
     if not result.moves:

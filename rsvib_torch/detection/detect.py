@@ -41,7 +41,8 @@ def detect_vibration(frames: FramesOrFiles, timing: SensorTiming, options: Vibra
         The vibration in image axes (x, y) with standard deviations, a verdict for each axis, and the offset curve.
 
     Warns:
-        TimingWarning: If frames is a path, and the file states another frame rate than the sensor has.
+        TimingWarning: If frame start times, or the file that frames is a path of, state another frame rate than the
+            sensor has.
 
     Raises:
         ValueError: If there are fewer than two frames, a frame is constant or has too many missing pixels, or an option

@@ -119,6 +119,12 @@ def assumptions(
             if num_frames == 2
             else f"{rate} frames/s; frequencies scale with it; a wrong {row} adds multiples of it"
         )
+    if intervals := timing.other_intervals(timing.frame_starts(num_frames), num_rows):
+        apart = " to ".join(dict.fromkeys(f"{interval:.4g}" for interval in intervals))
+        sentences.append(
+            f"frame_start_times {apart} s apart, although the frame period is "
+            f"{timing.frame_period:.4g} s (frame_rows x row_time); wrong times give wrong frequencies"
+        )
     if timing.frame_start_times is None and timing.frame_rows == num_rows:
         sentences.append(
             f"frame_rows={num_rows} is the number of rows of the frames: there are no blanking rows, which is rare; "

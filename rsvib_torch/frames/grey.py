@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.checks.arrays import FramesOrFiles
-from rsvib_torch.frames.mosaic import is_mosaic, mosaic_free
+from rsvib_torch.frames.mosaic import are_mosaics, mosaic_free
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.frames.pixels import cut_columns, detailed_parts
 from rsvib_torch.frames.prepare import prepare_frames
@@ -94,7 +94,8 @@ def grey_frames(
         valid = _unless_complete(valid | (around > _MEASURED_AROUND))
     # a frame without detail has no displacement
     for stack, frame in _constant(images).nonzero().tolist():
-        raise ValueError(constant_frame(f"{frame}{of_stack(stack)}"))
+        place, remedy = f"{frame}{of_stack(stack)}", "leave out this stack" if prepared.batched else "remove this frame"
+        raise ValueError(f"{constant_frame(place)}; {remedy}")
     # a copy of a frame was exposed at another time than its place in the stack states
     for stack, first in _repeated(images).nonzero().tolist():
         raise ValueError(
@@ -109,17 +110,15 @@ def grey_frames(
 
 def without_mosaic(images: Tensor) -> Tensor:
     """Grey frames (B, T, H, W), of colour mosaics without the pattern of the colours, which does not move."""
-    first = images[:, 0]
-    mosaic = is_mosaic(first, blocks=32, least=1.5)  # a part of the pixels is enough to exclude most frames
+    mosaic = are_mosaics(images[:, 0])
     if not bool(mosaic.any()):
         return images
-    mosaic &= is_mosaic(first)
     return torch.where(mosaic[:, None, None, None], mosaic_free(images), images)
 
 
 def constant_frame(place: int | str) -> str:
     """Message for a frame whose pixels are equal."""
-    return f"frame {place} is constant and cannot be registered; remove this frame"
+    return f"frame {place} is constant and cannot be registered"
 
 
 def _constant(frames: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.io.stack_info import StackInfo
-from rsvib_torch.motion.timing import MAX_START_TIME, MIN_ROW_TIME, SensorTiming
+from rsvib_torch.motion.timing import MAX_START_TIME, MIN_ROW_TIME, SensorTiming, TimingWarning
 
 _RATE_TOLERANCE = 0.01  # relative; files state 30 for 29.97 frames per second (0.1 %)
 
@@ -21,10 +21,6 @@ _ORIENTATIONS = {
     7: "rotated by 90 degrees anticlockwise and mirrored left to right",
     8: "rotated by 90 degrees anticlockwise",
 }
-
-
-class TimingWarning(UserWarning):
-    """The frame rate or the times in a file contradict the timing of the sensor."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 import os
+import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -31,6 +32,10 @@ _MAX_BLANKING = 32  # row times per row; of more frames with so long a blanking 
 MAX_START_TIME = 1e10  # s; clocks that count from 1970 read 1.8e9 s, to 2e-7 s in float64
 _AGREEMENT = 1e-3  # relative; keys that state the same time twice are rounded by whoever wrote them
 _SCAN_AXES: dict[object, int] = {-2: -2, "y": -2, -1: -1, "x": -1}
+
+
+class TimingWarning(UserWarning):
+    """The frame rate or the times of frames contradict the timing of the sensor."""
 
 
 @dataclass(frozen=True)
@@ -83,9 +88,9 @@ class SensorTiming:
         if row_time < MIN_ROW_TIME:
             raise ValueError(f"row_time={row_time:g} s is shorter than 1 ns; row_time is in seconds")
         if row_time > 10e-3:
+            us = row_time if row_time >= 1 else 1e3 * row_time  # a number of us, or of ms
             raise ValueError(
-                f"row_time={row_time:g} s is longer than 10 ms; row_time is in seconds "
-                f"({row_time:g} us is {row_time:g}e-6)"
+                f"row_time={row_time:g} s is longer than 10 ms; row_time is in seconds ({us:g} us is {us:g}e-6)"
             )
         exposure_rows = check_number("exposure_rows", self.exposure_rows, above=0.0)
         frame_rows = check_number("frame_rows", self.frame_rows, above=0.0)
@@ -253,15 +258,43 @@ class SensorTiming:
                 f"{self.frame_rate:g} frames/s, row_time is at most {self.frame_period / num_rows:.6g} s"
             )
 
+    def other_intervals(self, starts: Tensor, num_rows: int) -> tuple[float, float] | None:
+        """Shortest and longest interval in s between frames that are not 1 to 3 frame periods apart, to 1 %.
+
+        Otherwise None, also for more missing frames between others, and for line sensors: frames of the latter have no
+        blanking rows, and start after delays.
+        """
+        if len(starts) < 2 or self.frame_rows <= num_rows:
+            return None
+        periods = starts.diff() / self.frame_period
+        whole = periods.round().clamp(min=1.0)
+        if float(periods.min()) < 3.1 and bool(((periods - whole).abs() <= 0.01 * whole).all()):
+            return None
+        return float(periods.min()) * self.frame_period, float(periods.max()) * self.frame_period
+
+    def contradiction(self, starts: Tensor, num_rows: int) -> str:
+        """Sentence about starts of frames whose intervals are all far from the frame period; empty if they are not."""
+        least, most = self.other_intervals(starts, num_rows) or (self.frame_period, self.frame_period)
+        if 0.9 * least <= self.frame_period <= most / 0.9:
+            return ""
+        return (
+            f"by their times, frames are {float(starts.diff().median()):.3g} s apart, but the frame period is "
+            f"{self.frame_period:.3g} s (frame_rows={self.frame_rows:g} x row_time={self.row_time:g} s): wrong times "
+            "give wrong frequencies; times are seconds, correct them or frame_rows"
+        )
+
     def check_span(self, num_frames: int, num_rows: int) -> None:
         """Raise a ``ValueError`` if frames are too far apart for their number of rows to resolve frequencies.
 
         The number of frequencies that are tried, and the time and memory that they take, grow with the span.
+        A ``TimingWarning`` states intervals between frames that are all far from the frame period.
         """
         check_whole_number("num_rows", num_rows, at_least=1)
         starts = self.frame_starts(num_frames)
         step, span = float(starts.diff().median()), float(starts[-1] - starts[0])
         if span <= self.row_time * max(MAX_SPAN, _MAX_BLANKING * num_frames * num_rows):
+            if text := self.contradiction(starts, num_rows):
+                warnings.warn(text, TimingWarning, stacklevel=2)
             return
         units = {"ms": 1e3, "us": 1e6, "ns": 1e9}  # within a factor of two
         unit = next((name for name, size in units.items() if 0.5 < step / (size * self.frame_period) < 2), None)

@@ -10,7 +10,7 @@ from rsvib_torch.checks.arrays import ArrayLike, FramesOrFiles
 from rsvib_torch.execution.parallel import threads_for
 from rsvib_torch.execution.precision import full_precision, outside_graphs
 from rsvib_torch.frames.entry_points import TimedModule, module_options, vibration_options
-from rsvib_torch.frames.mosaic import interpolated_colours
+from rsvib_torch.frames.mosaic import are_mosaics, interpolated_colours
 from rsvib_torch.frames.pixels import enlarged
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
 from rsvib_torch.imaging.sensor_model import Optics, sharpened
@@ -111,8 +111,9 @@ def restore(
             frame is larger than the frame.
 
     Warns:
-        RestorationWarning: If an axis is not restored, or the restored frames are no better than the raw ones. If all
-            axes of a detection are refused, the frames are returned unchanged.
+        RestorationWarning: If an axis is not restored, the restored frames are no better than the raw ones, or frames
+            of one channel are a colour mosaic and ``mosaic`` is not given. If all axes of a detection are refused, the
+            frames are returned unchanged.
 
     Example:
         >>> import rsvib_torch as rsv
@@ -135,6 +136,7 @@ def restore(
         saturation=options.saturation,
         mosaic=options.mosaic,
     )
+    warn_of_mosaic(prepared)
     if isinstance(vibration, FollowedVibration):
         result, _, left_alone = restore_each(prepared, vibration, options)
         for reason in left_alone:
@@ -228,6 +230,15 @@ def _as_taken(frames: PreparedFrames, joint: bool | int, scale: int) -> Tensor:
         images = images.masked_fill(frames.missing, math.nan)
     middle = images.shape[1] // 2
     return enlarged(images[:, middle : middle + 1] if joint is True else images, scale)
+
+
+def warn_of_mosaic(frames: PreparedFrames) -> None:
+    """Warn if frames that are restored as grey ones are mosaics of colours, by the first frame."""
+    if frames.colours is None and frames.images.shape[2] == 1 and bool(are_mosaics(frames.filled[:1, 0, 0])[0]):
+        warn_of_restoration(
+            "frames are raw frames of a colour sensor, whose colours are mixed if they are restored as grey frames: "
+            'state the pattern, e.g. mosaic="RGGB" (commands: --mosaic RGGB)'
+        )
 
 
 def _warn_if_worse(frames: PreparedFrames, restored: Tensor, motion: FrameMotion, joint: bool | int) -> None:

@@ -19,7 +19,13 @@ from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import RestorationOptions
 from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError
-from rsvib_torch.restoration.restore import check_optics, restore_each, restore_prepared, unchanged_frames
+from rsvib_torch.restoration.restore import (
+    check_optics,
+    restore_each,
+    restore_prepared,
+    unchanged_frames,
+    warn_of_mosaic,
+)
 from rsvib_torch.restoration.verdict.judge import judge_prepared
 from rsvib_torch.restoration.verdict.trust import vibration_to_undo
 from rsvib_torch.results.presentation import AXIS_NAMES
@@ -68,6 +74,7 @@ def restore_trusted(
     prepared = prepare_frames(frames, timing, saturation=options.saturation, mosaic=options.mosaic)
     if not bool(vibration.moving_axes().any()):
         return RestoredFrames(unchanged_frames(prepared, joint, scale), False, left_alone, None, False)
+    warn_of_mosaic(prepared)
     restored = restore_prepared(prepared, vibration, options)
     verdict = None
     with suppress(TooLittleInCommonError):

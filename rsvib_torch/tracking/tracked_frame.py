@@ -80,7 +80,8 @@ class TrackedFrame:
         frame: The frame as given.
         tones: The tones at this frame; None if they are not known.
         options: Options of the tracker.
-        lost: Why the motion that was followed until the frame before is not known any more; empty if it is.
+        lost: Why the motion that was followed until the frame before is not known any more, or that it cannot be found
+            because the times contradict the frame period; otherwise empty.
         latency: Number of frames that were given after this one.
     """
 

@@ -148,7 +148,7 @@ class TrackerState:
     untried: int = 0  # frames since the last attempt to detect the vibration
     attempts: int = 0  # to detect the vibration, since the rows last agreed with the tones
     contradictions: int = 0  # consecutive frames, and starts of the filter, whose rows contradict the tones
-    lost: str = ""  # why the motion that was followed until the last frame is not known any more
+    lost: str = ""  # why the motion is not known, of one that was followed or if times contradict the frame period
 
     def without_track(self, reason: str) -> "TrackerState":
         """The state without the motion that was followed, if there was one."""
@@ -251,6 +251,9 @@ class VibrationTracker:
                 state = self._detected(self._measured(state)) if predicted is None else predicted
             except (ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
                 state = state.without_track(str(error).partition("\n")[0])  # no argument is wrong: they were checked
+        if not state.lost and (state.track is None or state.contradictions >= PATIENCE):
+            starts = tensor(np.array([*(frame.time for frame in self._state.frames), time]))
+            state = replace(state, lost=self._rows.contradiction(starts, 0))
 
         # 3. The result, moved to where the steady image is.
         tracked = self._result(prepared, state)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from truth import Curve, Motion, recorded
 
-from rsvib_torch import SensorTiming, detect_vibration
+from rsvib_torch import SensorTiming, TimingWarning, detect_vibration
 
 HEIGHT, WIDTH, RATE = 200, 160, 24.0
 TIMING = SensorTiming(row_time=1 / (RATE * 230), exposure_rows=8, frame_rows=230)
@@ -29,6 +29,15 @@ def walk(times):
 @pytest.fixture(scope="module")
 def frames():
     return recorded((HEIGHT, WIDTH), TIMING, MOTION, 4, 0.005, seed=8)
+
+
+@pytest.mark.parametrize("seconds", [1.0, 0.085, 0.034])  # frame numbers, and other frame rates
+def test_frame_start_times_far_from_the_frame_period_cause_a_warning(frames, seconds):
+    stated = replace(TIMING, frame_start_times=tuple(seconds * number for number in range(4)))
+    message = f"by their times, frames are {seconds:g} s apart, but the frame period is 0.0417 s"
+    with pytest.warns(TimingWarning, match=message):
+        found = detect_vibration(frames, stated)
+    assert any(f"frame_start_times {seconds:g} s apart" in text for text in found.assumptions)
 
 
 def causes(found):

@@ -209,8 +209,15 @@ def test_assumptions_state_what_the_frames_cannot_contradict():
     effect = next(text for text in two if text.startswith("frame_rows=110:"))
     assert effect.endswith("x 55 Hz: amplitude -5.5 %")  # frequencies follow from the rows of a frame
     assert any("two frames" in text for text in two)
-    (four,) = assumptions(vibration, sensitivity, replace(TIMING, frame_start_times=(0.0, 0.05, 0.1, 0.15)), 4, ROWS)
-    assert not any("row_time" in text or "two frames" in text for text in four)
+    for periods, states_times in (((0, 1, 2, 5), False), ((0, 3, 6, 9), False), ((0, 1, 2, 3.04), True)):
+        starts = tuple(period * TIMING.frame_period for period in periods)
+        (four,) = assumptions(vibration, sensitivity, replace(TIMING, frame_start_times=starts), 4, ROWS)
+        assert not any("two frames" in text for text in four)
+        of_times = [text for text in four if "row_time" in text]
+        stated = "frame_start_times 0.04167 to 0.04333 s apart, although the frame period is 0.04167 s"
+        assert [text.startswith(stated) for text in of_times] == [True] * states_times
+    lines = replace(TIMING, frame_rows=ROWS, frame_start_times=(0.0, 0.003))  # of line sensors: delays
+    assert not any("apart" in text for text in assumptions(vibration, sensitivity, lines, 2, ROWS)[0])
     assert assumptions(replace(vibration, amplitude=0 * vibration.amplitude), sensitivity, TIMING, 2, ROWS) == ((),)
     still = replace(vibration, frequency=0 * vibration.frequency)  # of a fit without meaning
     (of_still,) = assumptions(still, sensitivity, TIMING, 2, ROWS, np.array([[1.0, 0.5, 0.0]]))

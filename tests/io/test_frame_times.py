@@ -11,7 +11,7 @@ from small_stack import TIMING
 import rsvib_torch as rsv
 from rsvib_torch import StackInfo
 from rsvib_torch.frames.prepare import prepare_frames
-from rsvib_torch.io import TimingWarning, describe_stack, exposure_times, timing_from_first_frame
+from rsvib_torch.io import describe_stack, exposure_times, timing_from_first_frame
 
 KEPT = [0, 1, 2, 4, 5, 9, 10]  # the other frames were dropped
 
@@ -50,7 +50,7 @@ def test_the_median_of_a_variable_frame_rate_need_not_be_that_of_the_sensor():
     times = np.cumsum([0, 1.4, 1.4, 1, 1, 1.03, 1.19, 1.3]) * TIMING.frame_period
     info = info_with(times, 1e-5)
     assert timing_from_first_frame(TIMING, info).frame_start_times == pytest.approx(times)
-    with pytest.warns(TimingWarning, match=r"per second according to its time stamps, but 240\.38"):
+    with pytest.warns(rsv.TimingWarning, match=r"per second according to its time stamps, but 240\.38"):
         fast = timing_from_first_frame(replace(TIMING, frame_rows=41.6), info)  # slow motion
     assert fast.frame_start_times is None
 
@@ -75,7 +75,8 @@ def test_a_slow_change_of_the_frame_rate_is_not_mistaken_for_equal_intervals():
 
 def test_irregular_times_that_are_too_rough_are_reported():
     info = info_with(np.cumsum([0, *[1] * 7, *[1.48] * 6]) * TIMING.frame_period, 5e-3)
-    with pytest.warns(TimingWarning, match=r"time stamps are irregular and have errors of up to 5 ms; equal intervals"):
+    message = r"time stamps are irregular and have errors of up to 5 ms; equal intervals"
+    with pytest.warns(rsv.TimingWarning, match=message):
         assert timing_from_first_frame(TIMING, info) is TIMING
 
 
@@ -88,14 +89,14 @@ def test_a_frame_rate_that_contradicts_the_sensor_is_reported_with_the_remedy(in
         replace(info_with(interval * np.arange(9)), frame_times=None, frame_rate=1 / interval),
     ):
         assert exposure_times(info, TIMING) is None
-        with pytest.warns(TimingWarning, match=f"{rate}.*{remedy}"):
+        with pytest.warns(rsv.TimingWarning, match=f"{rate}.*{remedy}"):
             assert timing_from_first_frame(TIMING, info) is TIMING
 
 
 def test_exact_times_may_be_those_of_every_nth_frame():
     fourth = info_with(4 * TIMING.frame_period * np.arange(9), 0.0)
     assert timing_from_first_frame(TIMING, fourth).frame_start_times == fourth.frame_times
-    with pytest.warns(TimingWarning, match=r"128\.21 frames per second .* the times of the file are used"):
+    with pytest.warns(rsv.TimingWarning, match=r"128\.21 frames per second .* the times of the file are used"):
         used = timing_from_first_frame(TIMING, info_with(0.75 * TIMING.frame_period * np.arange(9), 0.0))
     assert used.frame_start_times[1] == pytest.approx(0.75 * TIMING.frame_period)
 

@@ -16,7 +16,7 @@ from small_stack import CAMERA, OPTIONS, TIMING
 from small_video import PERIOD, draw_frames
 
 import rsvib_torch as rsv
-from rsvib_torch.io import TimingWarning, read_stack, read_stack_info, timing_from_first_frame, write_stack
+from rsvib_torch.io import read_stack, read_stack_info, timing_from_first_frame, write_stack
 
 KEPT = np.array([0, 1, 2, 4, 5, 9])  # the other frames were dropped
 TIMES = KEPT * PERIOD
@@ -78,7 +78,7 @@ def test_frame_rate_in_hdf5_is_compared(tmp_path, name, place):
         else:
             file[place].attrs[name] = 30.0
     message = rf"a\.h5: 30 frames per second according to its attribute {name}, but 96\.154 .* \(frame_rows=333\.333\)"
-    with pytest.warns(TimingWarning, match=message):
+    with pytest.warns(rsv.TimingWarning, match=message):
         timing_from_first_frame(TIMING, read_stack_info(tmp_path / "a.h5"))
 
 
@@ -98,7 +98,7 @@ def test_times_in_zarr_attributes(tmp_path):
 )
 def test_frame_rate_in_tiff_is_compared(tmp_path, metadata):
     tifffile.imwrite(tmp_path / "a.tif", FRAMES, photometric="minisblack", **metadata)
-    with pytest.warns(TimingWarning, match=r"a\.tif: 30 frames per second according to its (ImageJ|OME)"):
+    with pytest.warns(rsv.TimingWarning, match=r"a\.tif: 30 frames per second according to its (ImageJ|OME)"):
         timing_from_first_frame(TIMING, read_stack_info(tmp_path / "a.tif"))
 
 
@@ -226,5 +226,5 @@ def test_commands_and_functions_warn_once_of_another_frame_rate(tmp_path, capsys
         lambda: rsv.process_stack(tmp_path / "a.h5", tmp_path / "b.tif", TIMING, **options),
         lambda: rsv.detect_vibration(tmp_path / "a.h5", TIMING, **OPTIONS["detection"]),
     ):
-        with pytest.warns(TimingWarning, match="30 frames per second"):
+        with pytest.warns(rsv.TimingWarning, match="30 frames per second"):
             call()

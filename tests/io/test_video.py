@@ -143,7 +143,7 @@ def test_matroska_may_begin_at_any_time(tmp_path):
     assert read_stack_info(tmp_path / "a.mkv").shape == (8, 32, 48)
 
 
-@pytest.mark.filterwarnings("default::rsvib_torch.io.TimingWarning")
+@pytest.mark.filterwarnings("default::rsvib_torch.motion.timing.TimingWarning")
 def test_slow_motion_keeps_the_times_of_playback_and_warns(place, capsys):
     times = np.arange(8) * PERIOD
     write_clip(place / "slow.mp4", times, shown_at=np.arange(8) / 25)

@@ -11,6 +11,7 @@ from truth import decibel, draw_scene
 
 import rsvib_torch as rsv
 from rsvib_torch.frames.mosaic import colour_frames, is_mosaic
+from rsvib_torch.restoration import RestorationWarning
 from rsvib_torch.restoration.exact.mosaic_scene import MosaicSolver
 from rsvib_torch.restoration.exact.scene_solver import Partition
 from rsvib_torch.restoration.frame_motion import frame_motion
@@ -66,6 +67,14 @@ def clean(scene):
 @pytest.fixture(scope="module")
 def frames(clean):
     return raw(clean)
+
+
+def test_a_mosaic_that_is_restored_as_grey_frames_causes_a_warning(clean, frames):
+    with pytest.warns(RestorationWarning, match='raw frames of a colour sensor.* e.g. mosaic="RGGB"'):
+        restored(frames, mosaic=None)
+    grey = noisy(clean[:, 0], NOISE)
+    without_warning(restored, grey, mosaic=None)
+    without_warning(restored, frames)
 
 
 def test_frames_together_contain_the_colours_that_each_lacks(scene, frames):
@@ -164,12 +173,16 @@ def test_detection_in_raw_frames():
     frames = raw(clean)
     assert error(frames) < 0.02  # px; 0.06 without the filter
     grey = torch.from_numpy(clean.mean(1)).float()
+    sign = 1 - 2 * (torch.arange(128) % 2)
+    twice_green = grey * (1 + 0.1 * sign + 0.1 * sign[:, None])  # red and blue together
     for blocks in (None, 4):
         assert is_mosaic(frames, blocks=blocks).all()
+        assert is_mosaic(twice_green, blocks=blocks).all()
         assert not is_mosaic(grey, blocks=blocks).any()
     assert not is_mosaic(torch.randn(3, 64, 64, generator=torch.Generator().manual_seed(1))).any()
     column = torch.arange(128)[None, :].expand(128, -1)
     assert not is_mosaic(torch.sin(2.9 * column).float()[None])  # detail near 1/2 cycle per px
+    assert not is_mosaic(grey * (1 + 0.1 * sign)).any()  # columns that alternate
 
 
 def test_frames_that_do_not_fit_are_reported(frames):

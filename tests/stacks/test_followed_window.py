@@ -57,6 +57,15 @@ def test_every_frame_of_a_vibration_that_decays_is_restored(place):
     assert manifest.settings["follow"] is True
 
 
+def test_the_report_states_how_many_frames_were_left_as_taken(place, tmp_path):
+    frames = np.load(place / "frames.npy")
+    frames[5] = 0.5
+    np.save(tmp_path / "frames.npy", frames)
+    report = follow(tmp_path, tmp_path / "out.npy")
+    assert report.as_taken == 1
+    assert f"{report.windows} restored (1 frame of these as taken)" in report.summary()
+
+
 def errors_of(found, start, first=0):
     """(T, 2) px, rms error of the displacement of the rows of frames from ``first`` on; time origin at ``start``."""
     rows = np.arange(128) * TIMING.row_time + 0.5 * TIMING.exposure_time

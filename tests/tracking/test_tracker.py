@@ -312,6 +312,17 @@ def test_wrong_frames_and_times_are_refused(steady):
     assert tracker.update(frames[1], 1.5).state == "searching"
 
 
+@pytest.mark.parametrize("unit", [1e3, 1e6, RATE, 2.5])  # ms, us, numbers of frames, and another frame rate
+def test_times_in_another_unit_are_why_no_motion_is_found(steady, unit):
+    frames, _ = steady
+    for tracked in track(frames[:6], [unit * number / RATE for number in range(6)])[1:]:
+        if tracked.state == "searching":
+            message = f"by their times, frames are {unit / RATE:.3g} s apart, but the frame period is 0.0333 s"
+            assert tracked.lost.startswith(message) or "motion" in tracked.lost
+    for tracked in track(frames[:3], [0.0, 1 / RATE, 9 / RATE]):  # frames are missing
+        assert tracked.lost == ""
+
+
 def test_large_motions_with_gaps_end_in_a_search_and_not_in_an_error(steady):
     """Filters whose covariance overflows, or whose equations have no solution, ended the session."""
     frames, _ = steady

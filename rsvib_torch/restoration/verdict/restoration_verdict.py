@@ -41,9 +41,9 @@ class RestorationVerdict(
             1 ... 2 where motion, blur and noise explain the frame.
         predicted_gain: (P,) dB, improvement: estimated PSNR of the restored frames minus that of the raw ones. It is
             valid where the motion is right and complete, NaN where it is not and has the opposite sign of the outcome.
-        outcome: For each pair: ``"helps"``; ``"partly"``: the vibration explains only a part of the displacement;
-            ``"worse"``; ``"unknown"``: cannot be determined from this pair (vibration too small, or at a blind
-            frequency; frames without contrast; too many missing pixels).
+        outcome: For each pair: ``"helps"``; ``"partly"``: the vibration explains only a part of the displacement,
+            and restored frames may be better or worse; ``"worse"``; ``"unknown"``: cannot be determined from this pair
+            (vibration too small, or at a blind frequency; frames without contrast; too many missing pixels).
         findings: The ``Reason`` objects of each pair; none where restoration helps. ``reasons`` has their texts.
     """
 
@@ -97,7 +97,7 @@ class RestorationVerdict(
         sentences = {
             "helps": "restored frames agree" + ("" if math.isnan(gain) else f"; estimated improvement {gain:+.1f} dB"),
             "unknown": f"cannot determine whether restoration helps{counted}: {self.reasons[worst]}",
-            "partly": f"restoration helps in part only{counted}: {self.reasons[worst]}",
+            "partly": f"the motion is wrong in part, restored may be worse than raw{counted}: {self.reasons[worst]}",
             "worse": f"restored is no better than raw{counted}: {self.reasons[worst]}",
         }
         return sentences[self.overall]
