@@ -143,6 +143,20 @@ def test_matroska_may_begin_at_any_time(tmp_path):
     assert read_stack_info(tmp_path / "a.mkv").shape == (8, 32, 48)
 
 
+def test_a_stated_frame_rate_replaces_jitter(place, capsys):
+    times = np.arange(8) * PERIOD
+    clip = place / "jitter.mp4"
+    write_clip(clip, times, shown_at=times + 0.2 * PERIOD * np.cos(np.arange(8)))
+    config = ("--config", place / "camera.toml", "--json")
+    found = []
+    for more in ((), ("--frame-rate", 1 / PERIOD)):
+        assert rsvib("detect", clip, *config, *more, "--out", place / f"found{len(more)}") == 0
+        shown = capsys.readouterr().out
+        found.append(json.loads(shown)["detection"]["reliable"])
+        assert ("equal intervals by --frame-rate replace the time stamps" in shown) == bool(more)
+    assert found == [[False, False], [True, True]]
+
+
 @pytest.mark.filterwarnings("default::rsvib_torch.io.TimingWarning")
 def test_slow_motion_keeps_the_times_of_playback_and_warns(place, capsys):
     times = np.arange(8) * PERIOD
