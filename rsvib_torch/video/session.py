@@ -33,7 +33,7 @@ class LiveReport:
 
     frames: int = 0  # that were written
     tracked: int = 0  # frames whose motion was known
-    corrected: int = 0  # tracked frames from which tones were removed
+    corrected: int = 0  # frames from which tones were removed
     predicted: int = 0  # tracked frames whose motion was predicted and not measured, because they were late
     unusable: int = 0  # frames that were constant, or copies
     dropped: int = 0  # frames that arrived and were dropped, because processing was too slow
