@@ -203,7 +203,8 @@ def _state_text(page: video.PageOutput) -> Callable[[tracking.TrackedFrame, vide
 def _answer(source: str, report: video.LiveReport, files: list[Path], *, drops: bool) -> Answer:
     rate = f"{report.seconds:.1f} s ({report.frames / report.seconds:.1f} per second)"
     lines = [
-        f"{number_of(report.frames, 'frame')} in {rate}, {report.tracked} with known motion",
+        f"{number_of(report.frames, 'frame')} in {rate}, {report.tracked} with known motion, "
+        f"{report.corrected} corrected",
         f"dropped {report.dropped}, not delivered {report.lost}, unusable {report.unusable}; vibration detected "
         f"{number_of(report.detections, 'time')}",
     ]
@@ -213,7 +214,7 @@ def _answer(source: str, report: video.LiveReport, files: list[Path], *, drops: 
         delay = f"delay: {report.latency(0.5)} frame periods in the median"
         lines.append(f"{delay}, {report.latency(0.99)} in 99 % of the frames")
     found = report.detection
-    names = ("frames", "tracked", "predicted", "unusable", "dropped", "lost", "detections", "seconds")
+    names = ("frames", "tracked", "corrected", "predicted", "unusable", "dropped", "lost", "detections", "seconds")
     delays = {"delay_median": 0.5, "delay_99": 0.99}
     data = {name: getattr(report, name) for name in names}
     data |= {name: report.latency(part) if drops else None for name, part in delays.items()}

@@ -21,7 +21,7 @@ from rsvib_torch.commands.terminal import note
 from rsvib_torch.config import Config, read_config
 from rsvib_torch.files.atomic import check_outputs, check_writable
 from rsvib_torch.files.reading import Table
-from rsvib_torch.motion.timing import SensorSection
+from rsvib_torch.motion.timing import SensorSection, SensorTiming
 from rsvib_torch.options import RestorationOptions, method_options
 from rsvib_torch.text import AXES
 
@@ -166,6 +166,8 @@ class CameraOptions:
                 "such a file and explains its values)"
             )
         settings = read_config(self.config, sensor=sensor)
+        if frames is not None and "frame_rate" in self.sensor and settings.timing.frame_start_times is None:
+            settings = replace(settings, timing=_evenly_timed(settings.timing, io.read_stack_info(frames)))
         starts = settings.timing.frame_start_times
         if frame_range is not None and starts is not None:  # those of the file are read with its frames
             first, _, end = frame_range.partition(":")
@@ -306,6 +308,16 @@ def rate_of_file(frames: Path) -> float | None:
     if rate_of_frames is not None:
         note(f"frame rate {rate_of_frames:.6g} per second, from the times in {frames}; --frame-rate replaces it")
     return rate_of_frames
+
+
+def _evenly_timed(timing: SensorTiming, info: "StackInfo") -> SensorTiming:
+    """The timing with equal intervals in place of irregular time stamps that are within a quarter of one of them."""
+    stated = io.exposure_times(info, timing) if info.time_error else None
+    even = io.exposure_times(replace(info, time_error=0.25 * timing.frame_period), timing)
+    if stated is None or even is None or even == stated:
+        return timing
+    note(f"equal intervals by --frame-rate replace the {info.time_source} of {info.path}, which are irregular")
+    return replace(timing, frame_start_times=even)
 
 
 def stated_exposure(path: Path) -> float | None:

@@ -210,6 +210,7 @@ def _scan(path: Path, size: int, changed: int) -> tuple[StackInfo, tuple[Fractio
             orientation=_orientation(first),
             time_error=float(unit),
             time_source="time stamps",
+            metadata={"subtitles": None} if container.streams.subtitles else {},
             camera=_camera(container.metadata | stream.metadata),
         )
         picture = Picture(first.format.name, int(first.colorspace), int(first.color_range), (first.height, first.width))

@@ -154,8 +154,8 @@ def _unknown(name: str, modes: Sequence[CameraMode]) -> ValueError:
     if modes:
         more = f" and {len(similar) - 4} more (rsvib cameras lists all)" if len(similar) > 4 else ""
         return ValueError(
-            f"no camera in the table of readout times has exactly the name {quoted(name)}; names that contain it: "
-            f"{listed}{more}"
+            f"no camera in the table of readout times has exactly the name {quoted(name)}; give one of those that "
+            f"contain it if it is the camera: {listed}{more}"
         )
     return ValueError(f"no camera {quoted(name)} in the table of readout times; similar: {listed}")
 
@@ -195,18 +195,22 @@ def camera_mode(name: str, *, width: int, height: int, frame_rate: float) -> Cam
     def scale(mode: CameraMode) -> float:
         return max(mode.height / rows, rows / mode.height)
 
-    fitting = [
+    sized = [
         mode
         for mode in modes
-        if math.isclose(mode.width / mode.height, aspect, rel_tol=_SAME_ASPECT)
-        and math.isclose(mode.frame_rate, rate, rel_tol=_SAME_RATE)
-        and scale(mode) <= _MAX_SCALE
+        if math.isclose(mode.width / mode.height, aspect, rel_tol=_SAME_ASPECT) and scale(mode) <= _MAX_SCALE
     ]
+    fitting = [mode for mode in sized if math.isclose(mode.frame_rate, rate, rel_tol=_SAME_RATE)]
     if not fitting:
-        known = ", ".join(mode.size for mode in modes)
+        known = ", ".join(
+            f"{' '.join(filter(None, (mode.size, mode.lens)))} (readout {1e3 * mode.readout_time:.3g} ms)"
+            for mode in sorted(modes, key=lambda mode: mode not in sized)
+        )
+        # of 151 pairs of modes of one size with different rates, 96 have readout times within 5 %
+        other = "try --readout-time of a known rate, which is right for two of three cameras, or " if sized else ""
         raise ValueError(
             f"no mode of {modes[0].brand} {modes[0].model} has the aspect, rate and nearly the size of "
-            f"{width} x {height} px at {rate:.4g}/s: {known}; measure the row time (rsvib calibrate)"
+            f"{width} x {height} px at {rate:.4g}/s: {known}; {other}measure the row time (rsvib calibrate)"
         )
     best = [mode for mode in fitting if scale(mode) == min(map(scale, fitting))]
     if len(names := dict.fromkeys(mode.name for mode in best)) > 1:

@@ -137,7 +137,7 @@ class RunFolder:
         if records and not resume:
             raise FileExistsError(
                 f"{self.sink}: a run was interrupted here after {len(records)} windows; resume it (--resume), or "
-                f"delete {self.path} to start over"
+                f"delete {self.path} to start over (--overwrite does not discard finished windows)"
             )
         difference = records and stored is not None and _difference(stored, dict(header))
         if difference:

@@ -33,6 +33,7 @@ class LiveReport:
 
     frames: int = 0  # that were written
     tracked: int = 0  # frames whose motion was known
+    corrected: int = 0  # frames from which tones were removed
     predicted: int = 0  # tracked frames whose motion was predicted and not measured, because they were late
     unusable: int = 0  # frames that were constant, or copies
     dropped: int = 0  # frames that arrived and were dropped, because processing was too slow
@@ -170,6 +171,7 @@ def _tracked(
         tracked = tracker.update(frame.pixels, frame.time, measure=not is_late)
         is_tracked = tracked.state == "tracking"
         report.tracked += is_tracked
+        report.corrected += bool(tracked.motion.amplitude.any())
         report.predicted += is_tracked and tracked.measurements is None
         report.unusable += tracked.state == "unusable"
         report.detections += tracked.detected

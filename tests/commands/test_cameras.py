@@ -78,11 +78,17 @@ def test_table_has_no_row_that_contradicts_itself():
         (
             "iPhone 7",
             (3840, 2160, 30),
-            "exactly the name 'iPhone 7'; names that contain it: Apple iPhone 7 Plus",
+            "exactly the name 'iPhone 7'; give one of those that contain it if it is the camera: Apple iPhone 7 Plus",
         ),  # another camera
-        ("GoPro", (3840, 2160, 30), "names that contain it: GoPro HERO, GoPro HERO5 Black, .* and 1 more"),
+        ("GoPro", (3840, 2160, 30), "contain it if it is the camera: GoPro HERO, GoPro HERO5 Black, .* and 1 more"),
         ("iPhone 12", (1920, 1080, 24), "several modes fit.*: Apple iPhone 12 Ultra Wide, Apple iPhone 12 Wide"),
-        ("iPhone 12", (1920, 1080, 60), "no mode .* 1920 x 1080 px at 60/s: 3840 x 2160 px at 60/s, "),  # half the size
+        (
+            "iPhone 12",
+            (1920, 1080, 60),
+            "no mode .* at 60/s: 1920 x 1080 px at 24/s Ultra Wide .readout 15.7 ms., 1920 x 1080 px at 24/s Wide "
+            ".readout 6.6 ms., 3840 x 2160 px .*; try --readout-time of a known rate",
+        ),
+        ("iPhone 12", (640, 360, 60), ": 3840 x 2160 px at 60/s .readout 4.98 ms., .*; measure the row time"),
         ("iPhone 12", (3840, 2160, 30), "no mode of Apple iPhone 12"),  # another rate
     ],
 )

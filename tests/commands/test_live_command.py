@@ -34,6 +34,7 @@ def test_from_file_to_video(clip, tmp_path, capsys):
     shown = capsys.readouterr()
     answer = json.loads(shown.out)
     assert (answer["frames"], answer["tracked"], answer["dropped"], answer["detections"]) == (COUNT, COUNT - 3, 0, 1)
+    assert answer["corrected"] == COUNT - 3
     frequency = np.array(answer["detection"]["vibration"]["frequency"])[:, 0]
     assert frequency == pytest.approx([52.0, 71.0], abs=0.1)
     assert [path.name for path in tmp_path.iterdir()] == ["still.mkv"]

@@ -119,7 +119,10 @@ def test_interrupted_run_is_resumed_or_refused(place, tmp_path, capsys, monkeypa
         patch.setattr("rsvib_torch.stacks.process.write_frames", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         assert rsvib(*command(place, out)) == 130
     assert "--resume continues" in capsys.readouterr().err
-    assert "a run was interrupted here after 4 windows; resume it (--resume)" in refused(capsys, *command(place, out))
+    for more in ((), ("--overwrite",)):
+        error = refused(capsys, *command(place, out, *more))
+        assert "a run was interrupted here after 4 windows; resume it (--resume)" in error
+        assert "to start over (--overwrite does not discard finished windows)" in error
     for _ in range(2):  # the second time it is complete
         assert rsvib(*command(place, out, "--resume")) == 0
         assert "windows complete before this run: 4" in capsys.readouterr().out

@@ -73,6 +73,21 @@ def test_a_slow_change_of_the_frame_rate_is_not_mistaken_for_equal_intervals():
     assert exposure_times(info, replace(TIMING, frame_rows=108)) == info.frame_times
 
 
+@pytest.mark.parametrize("kept", [list(range(60)), [*range(20), *range(21, 61)]])
+def test_jitter_that_does_not_add_up_is_not_a_variable_rate(kept):
+    rng = np.random.default_rng(0)
+    jitter = rng.uniform(-0.2, 0.2, 60)
+    of_clock = info_with((kept + jitter) * TIMING.frame_period, 1e-5)
+    even = pytest.approx(np.multiply(kept, TIMING.frame_period), rel=1e-12)
+    assert exposure_times(of_clock, TIMING) == even
+    assert "ms like those of a program that records; equal intervals are used" in describe_stack(of_clock, TIMING)[-1]
+    exact = replace(of_clock, time_error=0.0)
+    alternating = info_with((kept + 0.1 * (-1.0) ** np.arange(60)) * TIMING.frame_period, 1e-5)
+    walking = info_with((kept + np.cumsum(rng.uniform(-0.06, 0.06, 60))) * TIMING.frame_period, 1e-5)
+    for info in (exact, alternating, walking):
+        assert exposure_times(info, TIMING) == info.frame_times
+
+
 def test_irregular_times_that_are_too_rough_are_reported():
     info = info_with(np.cumsum([0, *[1] * 7, *[1.48] * 6]) * TIMING.frame_period, 5e-3)
     message = r"time stamps are irregular and have errors of up to 5 ms; equal intervals"

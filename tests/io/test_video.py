@@ -14,7 +14,15 @@ from small_stack import CAMERA, STILL
 from small_video import PERIOD, sound_of, write_clip, write_video
 from truth import decibel
 
-from rsvib_torch.io import FrameError, StackInfo, open_stack, read_stack, read_stack_info, write_stack
+from rsvib_torch.io import (
+    FrameError,
+    StackInfo,
+    metadata_not_kept,
+    open_stack,
+    read_stack,
+    read_stack_info,
+    write_stack,
+)
 
 TIMES = np.arange(6) / 30
 DROPPED = np.array([0, 1, 2, 4, 5, 9, 10, 11]) * PERIOD
@@ -143,6 +151,20 @@ def test_matroska_may_begin_at_any_time(tmp_path):
     assert read_stack_info(tmp_path / "a.mkv").shape == (8, 32, 48)
 
 
+def test_a_stated_frame_rate_replaces_jitter(place, capsys):
+    times = np.arange(8) * PERIOD
+    clip = place / "jitter.mp4"
+    write_clip(clip, times, shown_at=times + 0.2 * PERIOD * np.cos(np.arange(8)))
+    config = ("--config", place / "camera.toml", "--json")
+    found = []
+    for more in ((), ("--frame-rate", 1 / PERIOD)):
+        assert rsvib("detect", clip, *config, *more, "--out", place / f"found{len(more)}") == 0
+        shown = capsys.readouterr().out
+        found.append(json.loads(shown)["detection"]["reliable"])
+        assert ("equal intervals by --frame-rate replace the time stamps" in shown) == bool(more)
+    assert found == [[False, False], [True, True]]
+
+
 @pytest.mark.filterwarnings("default::rsvib_torch.motion.timing.TimingWarning")
 def test_slow_motion_keeps_the_times_of_playback_and_warns(place, capsys):
     times = np.arange(8) * PERIOD
@@ -151,6 +173,18 @@ def test_slow_motion_keeps_the_times_of_playback_and_warns(place, capsys):
     assert rsvib("run", place / "slow.mp4", place / "out", *arguments) == 0
     assert capsys.readouterr().err.count("25 frames per second according to its time stamps, but 96.154") == 1
     assert read_stack_info(place / "out" / "restored.mp4").frame_times == pytest.approx(np.arange(8) / 25)
+
+
+def test_subtitles_are_listed_as_not_kept(tmp_path):
+    (tmp_path / "a.srt").write_text("1\n00:00:00,000 --> 00:00:00,100\nHello\n")
+    with av.open(str(tmp_path / "a.srt")) as texts, av.open(str(tmp_path / "a.mkv"), "w") as output:
+        encoder = output.add_stream("ffv1", rate=30)
+        encoder.height, encoder.width, encoder.pix_fmt = 48, 64, "gray"
+        output.add_stream_from_template(texts.streams.subtitles[0])
+        for pixels in noise(8):
+            output.mux(encoder.encode(av.VideoFrame.from_ndarray(pixels, format="gray")))
+        output.mux(encoder.encode())
+    assert metadata_not_kept(read_stack_info(tmp_path / "a.mkv"), "b.mkv", (6, 48, 64)) == ("subtitles",)
 
 
 def test_frames_can_be_read_in_any_order(tmp_path):

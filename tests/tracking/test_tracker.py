@@ -181,6 +181,19 @@ def test_a_camera_at_rest_needs_no_further_detection():
     assert not tracked[-1].motion.moving_axes().any()
 
 
+@pytest.mark.parametrize(("roll", "frequency", "reliable"), [(0.01, 0.5, True), (0.003, 41.0, False)])
+def test_a_slow_roll_of_the_hand_does_not_affect_tones_but_a_fast_one_does(roll, frequency, reliable):
+    timing = rsv.SensorTiming(row_time=100e-6, exposure_rows=6, frame_rows=1 / RATE / 100e-6)
+    rolling = rsv.Vibration([*A, roll], [*F, frequency], [0.5, 1.0, 0.3])
+    frames = rsv.simulate_frames(draw_scene(320, 320, seed=3), timing, rolling, 9, frame_size=(240, 240))
+    tracker = rsv.VibrationTracker(timing)
+    found = [one.detection for one in map(tracker.update, frames) if one.detection is not None]
+    assert len(found) == 6
+    assert all(bool(one.reliable[0]) == reliable for one in found)
+    if reliable:
+        assert [float(one.vibration.amplitude[0, 0]) for one in found] == pytest.approx([A[0]] * 6, abs=0.015)  # px
+
+
 def test_attempts_to_detect_motion_without_tones_become_rare():
     random = np.random.default_rng(4)
     frequencies, phases = random.uniform(35.0, 200.0, (2, 60)), random.uniform(0.0, 2 * np.pi, (2, 60))

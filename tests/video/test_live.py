@@ -268,6 +268,14 @@ def test_the_motion_of_late_frames_is_predicted(drops):
     assert (report.predicted > 5) == drops
 
 
+def test_frames_of_a_camera_at_rest_are_tracked_but_not_corrected():
+    noise = np.random.default_rng(0).normal(0.0, 0.005, (6, 160, 160))
+    frames = (draw_scene(160, 160, seed=3) + noise).astype(np.float32)
+    report = video.run_live(Shaking(frames), rsv.VibrationTracker(TIMING), [], drops=False)
+    assert report.tracked >= 2
+    assert report.corrected == 0
+
+
 class Uneven(Numbers):
     """Two frames come within one frame period, as from a webcam or a video of variable frame rate."""
 

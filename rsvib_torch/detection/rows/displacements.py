@@ -312,9 +312,12 @@ def column_pattern_of(
 _SUMMED_ROWS = 64  # rows of a sum from which the displacements of parts of the rows are found
 
 
-def differential_motion(gradients: list[RowGradients], stacks: int) -> Array:
-    """(B, 2) px, rms difference of the displacements of the halves of the rows, by rotation or parallax; no noise."""
-    return _rms_of_contrasts(gradients, stacks, [[-1.0, 1.0]])
+def differential_motion(gradients: list[RowGradients], stacks: int, *, uniform: bool = True) -> Array:
+    """(B, 2) px, rms difference of the displacements of the halves of the rows, by rotation or parallax; no noise.
+
+    Without a ``uniform`` difference, which all rows have in common: a slow roll causes one.
+    """
+    return _rms_of_contrasts(gradients, stacks, [[-1.0, 1.0]], uniform=uniform)
 
 
 def uneven_motion(gradients: list[RowGradients], stacks: int) -> Array:
@@ -323,7 +326,9 @@ def uneven_motion(gradients: list[RowGradients], stacks: int) -> Array:
     return _rms_of_contrasts(gradients, stacks, [quadratic, cubic])
 
 
-def _rms_of_contrasts(gradients: list[RowGradients], stacks: int, weights: list[list[float]]) -> Array:
+def _rms_of_contrasts(
+    gradients: list[RowGradients], stacks: int, weights: list[list[float]], *, uniform: bool = True
+) -> Array:
     """(B, 2) px, root of the trimmed mean of the sum of squared contrasts between the parts of the rows; without noise.
 
     The gradients are those of all groups of B ``stacks``. The weights of each contrast are those of the parts. Noise
@@ -334,8 +339,10 @@ def _rms_of_contrasts(gradients: list[RowGradients], stacks: int, weights: list[
     for of_group in gradients:
         residual, noise, regular = displacements_of_parts(of_group, len(weights[0]))
         contrasts = residual.new_tensor(weights)
-        variance = contrasts.square() @ noise
-        excess = ((contrasts @ residual).square() - variance).sum(2)
+        variance, moved = contrasts.square() @ noise, contrasts @ residual
+        if not uniform and moved.shape[1] > 2:  # two sums of rows do not tell it from roll within the frame
+            moved = moved - moved.where(regular[..., None, None], torch.nan).nanmedian(1, keepdim=True).values
+        excess = (moved.square() - variance).sum(2)
         both = torch.cat([excess, 2 * variance.square().sum(2)], -1)  # and the variance of the excess
         both = torch.where(regular[..., None], both, torch.nan)
         found.append(_of_stacks(both, len(both) // stacks))
