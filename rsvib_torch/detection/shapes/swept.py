@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.optimize import least_squares
+from scipy.optimize import OptimizeResult, least_squares
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import check_shapes
@@ -52,6 +52,7 @@ _STARTS = 7.5  # starts over the squared number of periods of the highest freque
 _MAX_STARTS = 100_000  # the search takes 0.5 s for frames of 266 rows; a part of the record has fewer
 # probability; of 96 axes of frames of noise, 54 were reliable without this limit and 0 of 60 with it
 _MAX_CHANCE = 0.01
+_LARGEST = 1e3  # px, displacement of a fit
 _MOST_STEPS = 25  # evaluations of a fit from one start
 # factors of the parameters [a, b, f, g, c, v]: of the same tone with the opposite frequency, and of no tone
 _MIRRORED, _STILL = np.array([1.0, -1.0, -1.0, 1.0, -1.0, 1.0]), np.array([0.0, 0.0, 1.0, 1.0, 1.0, 1.0])
@@ -419,19 +420,23 @@ def _settle(
         relative = measured.relative(values[None])[0]
         return (root.reshape(-1, *(1,) * (values.ndim - 1)) * relative).reshape(-1, *values.shape[2:])
 
-    # 2. The fits, best first; the opposite frequency, sweep and sine part are the same tone.
+    # 2. The fits, best first; the opposite frequency, sweep and sine part are the same tone. To noise, a tone may be
+    # fitted that grows to any size, beside which its start is kept.
     data = whitened(measured.displacements[0, ..., axis])
-    found = [
-        least_squares(
+
+    def solved(start: Array, most_steps: int) -> OptimizeResult:
+        return least_squares(
             lambda fit: whitened(_value(times, fit) @ shares) - data,
             start,
             lambda fit: whitened(_columns(times, fit, shares)),
             method="lm",
             x_scale="jac",
-            max_nfev=_MOST_STEPS,
+            max_nfev=most_steps,
         )
-        for start in starts
-    ]
+
+    found = [solved(start, _MOST_STEPS) for start in starts]
+    is_bounded = [np.abs(_value(times, one.x)).max() < _LARGEST for one in found]
+    found = [one if fits else solved(start, 1) for one, start, fits in zip(found, starts, is_bounded, strict=True)]
     found.sort(key=lambda one: one.cost)
     signs = np.array([_MIRRORED if one.x[2] < 0 else np.ones(6) for one in found])
     jacobians = np.stack([one.jac for one in found]) * signs[:, None]
