@@ -5,6 +5,7 @@ from pathlib import Path
 import psutil
 import pytest
 import torch
+from hypothesis import settings
 from matplotlib.backend_bases import FigureCanvasBase
 from PIL import Image
 from small_stack import FRAMES, WINDOWS, process_small, write_small
@@ -12,6 +13,8 @@ from small_stack import FRAMES, WINDOWS, process_small, write_small
 from rsvib_torch import SensorTiming
 from rsvib_torch.commands import terminal
 
+settings.register_profile("any machine", deadline=None)  # the first example imports what it uses
+settings.load_profile("any machine")
 TESTS = Path(__file__).parent
 ALGORITHMS = ("detection", "registration", "restoration", "tracking", "test_imports.py", "test_turned_frames.py")
 RENDERED = {"report", "test_presentation.py", "test_docs.py", "test_spectrum.py"}  # tests of figures

@@ -119,7 +119,8 @@ def assumptions(
             if num_frames == 2
             else f"{rate} frames/s; frequencies scale with it; a wrong {row} adds multiples of it"
         )
-    if intervals := timing.other_intervals(timing.frame_starts(num_frames), num_rows):
+    intervals = timing.other_intervals(timing.frame_starts(num_frames), num_rows)
+    if intervals is not None:
         apart = " to ".join(dict.fromkeys(f"{interval:.4g}" for interval in intervals))
         sentences.append(
             f"frame_start_times {apart} s apart, although the frame period is "

@@ -11,7 +11,7 @@ from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.motion.timing import MAX_START_TIME, MIN_ROW_TIME, SensorTiming, TimingWarning
 
 _RATE_TOLERANCE = 0.01  # relative; files state 30 for 29.97 frames per second (0.1 %)
-# Times from which independent deviations are told from those that add up: of 4000 random walks of 60 times, 0.2 % seem
+# Times from which independent deviations differ from those that add up: of 4000 random walks of 60 times, 0.2 % seem
 # independent, of 30 times 10 %
 _MIN_STAMPS = 50
 

@@ -110,7 +110,8 @@ def _frames(container: InputContainer) -> Generator[av.VideoFrame, None, None]:
     packets = container.demux(stream)
     while True:
         with suppress(av.error.InvalidDataError):
-            if (packet := next(packets, None)) is None:
+            packet = next(packets, None)
+            if packet is None:
                 return
             yield from packet.decode()
 

@@ -293,7 +293,8 @@ class SensorTiming:
         starts = self.frame_starts(num_frames)
         step, span = float(starts.diff().median()), float(starts[-1] - starts[0])
         if span <= self.row_time * max(MAX_SPAN, _MAX_BLANKING * num_frames * num_rows):
-            if text := self.contradiction(starts, num_rows):
+            text = self.contradiction(starts, num_rows)
+            if text:
                 warnings.warn(text, TimingWarning, stacklevel=2)
             return
         units = {"ms": 1e3, "us": 1e6, "ns": 1e9}  # within a factor of two

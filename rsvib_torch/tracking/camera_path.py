@@ -615,7 +615,7 @@ def fit_window(
             continue
         fit = best
         axes = [axis for axis in (0, 1) if sum(one.axis == axis for one in fit.tones) < _MOST_TONES]
-    # Tones that others explain in the end, that are none of all rows, or that are not told from their aliases.
+    # Tones that others explain in the end, that are none of all rows, or whose aliases explain them as well.
     number = -1
     for _ in range(4 * _MOST_TONES):
         if len(fit.tones) == number:

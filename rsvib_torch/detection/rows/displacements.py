@@ -340,7 +340,7 @@ def _rms_of_contrasts(
         residual, noise, regular = displacements_of_parts(of_group, len(weights[0]))
         contrasts = residual.new_tensor(weights)
         variance, moved = contrasts.square() @ noise, contrasts @ residual
-        if not uniform and moved.shape[1] > 2:  # two sums of rows do not tell it from roll within the frame
+        if not uniform and moved.shape[1] > 2:  # roll within the frame looks uniform in fewer sums of rows
             moved = moved - moved.where(regular[..., None, None], torch.nan).nanmedian(1, keepdim=True).values
         excess = (moved.square() - variance).sum(2)
         both = torch.cat([excess, 2 * variance.square().sum(2)], -1)  # and the variance of the excess
