@@ -31,17 +31,17 @@ def bspline_weights(fraction: Tensor, degree: int, derivative: int = 0) -> Tenso
 
 
 def spline_taps(
-    times: Array, start: float, spacing: float, count: int, *, degree: int = 3, derivative: int = 0
+    times: Array, start: float, spacing: float, count: int, *, derivative: int = 0
 ) -> tuple[NDArray[np.int64], Array]:
-    """The coefficients (..., degree + 1) of a spline, or its derivative, at times (...), and their factors.
+    """The coefficients (..., 4) of a cubic spline, or its derivative, at times (...), and their factors.
 
     The first of ``count`` coefficients belongs to the knot at ``start``; times and ``spacing`` are in s. The spline is
     constant beyond its ends.
     """
-    place = np.clip((times - start) / spacing, 0.0, count - degree)
-    cell = np.minimum(np.floor(place), count - degree - 1.0)
-    factors = table(bspline_weights(tensor(place - cell), degree, derivative)) / spacing**derivative
-    return cell.astype(np.int64)[..., None] + np.arange(degree + 1), factors
+    place = np.clip((times - start) / spacing, 0.0, count - 3)
+    cell = np.minimum(np.floor(place), count - 4.0)
+    factors = table(bspline_weights(tensor(place - cell), 3, derivative)) / spacing**derivative
+    return cell.astype(np.int64)[..., None] + np.arange(4), factors
 
 
 def spread_taps(cells: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:

@@ -36,7 +36,7 @@ from rsvib_torch.row_time.by_tones import (
 P = ParamSpec("P")
 
 _MIN_FRAMES = 3  # two frames determine the product of row time and frequency only
-SHORTEST_READOUT = 0.1  # of the frame period, if no row times are given
+_SHORTEST_READOUT = 0.1  # of the frame period, if no row times are given
 
 
 @option_group
@@ -148,7 +148,7 @@ def _limits(row_time: tuple[float, float] | None, period: float, num_rows: int) 
     """Shortest and longest possible row time in s."""
     longest = period / num_rows
     if row_time is None:
-        return SHORTEST_READOUT * longest, longest
+        return _SHORTEST_READOUT * longest, longest
     low, high = (check_number("row_time", value, above=0.0) for value in row_time)
     if low >= high:
         raise ValueError(f"row_time=({low:g}, {high:g}): the first must be smaller")

@@ -21,7 +21,7 @@ from rsvib_torch.registration.corners import CornerFollower, Corners, eight_bits
 from rsvib_torch.row_time.by_tones import CameraClock, RowTimeFit
 from rsvib_torch.tracking.camera_path import WindowPath, averaging, distances_left, fit_window
 
-MAX_PATH_STD = 0.05  # of the row time; a twentieth of what the rows are displaced by remains in restored frames
+_MAX_STD = 0.05  # of the row time; a twentieth of what the rows are displaced by remains in restored frames
 _ROUGH = 0.25  # of the row time, standard deviation up to which a result is stated
 _MIN_PAIRS, _MOST_FRAMES = 20, 192  # of frames that are compared
 _PARTS = 12  # of consecutive pairs, whose scatter gives the standard deviation
@@ -54,19 +54,21 @@ class _FollowedCorners:
         """The corners with the times of a row time in s, negative for a reverse readout."""
         return replace(self.corners, times=self.starts + self.rows * row_time)
 
+    def _averaged(self, row_time: float) -> tuple[float, float]:
+        return averaging(self.clock.exposure_time or 0.0, abs(row_time), self.size)
+
     def squares(self, row_time: float, tones: Sequence[tuple[int, float]]) -> Array:
         """(3, P) px^2, square of the median residual of the corners of each pair of frames, and of both halves of it.
 
         It is left by a path and ``tones``, of which axis and frequency in Hz are given.
         """
-        averaged = averaging(self.clock.exposure_time or 0.0, abs(row_time), self.size)
-        distance = distances_left(self.timed(row_time), self.clock.period, averaged, tones)
+        distance = distances_left(self.timed(row_time), self.clock.period, self._averaged(row_time), tones)
         return np.array([[np.median(distance[part]) for part in parts] for parts in self.groups]) ** 2
 
     def window(self, row_time: float) -> WindowPath:
         """The path and the tones at a row time."""
-        averaged = averaging(self.clock.exposure_time or 0.0, abs(row_time), self.size)
-        return fit_window(self.timed(row_time), self.clock.period, averaged, self.size[0] * abs(row_time))
+        timed, readout = self.timed(row_time), self.size[0] * abs(row_time)
+        return fit_window(timed, self.clock.period, self._averaged(row_time), readout).path()
 
     def minimum(self, row_time: float, tones: Sequence[tuple[int, float]]) -> tuple[float, float] | None:
         """Row time near a first one at which least is left, and its standard deviation, in s; None without one."""
@@ -119,7 +121,7 @@ def row_time_of_path(stack: GreyFrames, clock: CameraClock) -> RowTimeFit | None
     nearest = math.copysign(min(max(abs(row_time), clock.low), clock.high), row_time)
     if abs(nearest - row_time) > 2.0 * std:
         return None
-    return RowTimeFit(nearest, std, permitted=MAX_PATH_STD)
+    return RowTimeFit(nearest, std, permitted=_MAX_STD)
 
 
 def _may_be_tone(window: WindowPath, period: float) -> bool:
@@ -141,6 +143,8 @@ def _may_be_tone(window: WindowPath, period: float) -> bool:
 
 def _followed(stack: GreyFrames, clock: CameraClock) -> _FollowedCorners | None:
     """The corners between the frames of one stack; None with too few pairs of frames."""
+    if stack.images.shape[1] <= _MIN_PAIRS:
+        return None
     images = stack.images[0, :_MOST_FRAMES].cpu().numpy()
     size = images.shape[1], images.shape[2]
     row_time = clock.period / size[0]

@@ -41,10 +41,10 @@ from rsvib_torch.options import MAX_TONES, RegistrationOptions
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
 
-MAX_CHI_SQUARE = 30.0  # above that of the best row time, for another one that explains the frames as well
+_MAX_CHI_SQUARE = 30.0  # above that of the best row time, for another one that explains the frames as well
 _LARGEST_STEP = 0.02  # of the row time, in an iteration
-MIN_SHARE = 0.2  # of the residual sum of squares that a further tone must explain
-MAX_STARTS = 5  # row times that are tried; of 8 random pairs of tones, 2 need a second
+_MIN_SHARE = 0.2  # of the residual sum of squares that a further tone must explain
+_MAX_STARTS = 5  # row times that are tried; of 8 random pairs of tones, 2 need a second
 # Chi-square of the frequencies of tones per row and per frame at a row time. Of 78 recordings whose row time was within
 # the limits, at most 5.5 for the bands and 8.9 for the rows; of 5 with a wrong result within wrong limits, 32 and more
 _MAX_CONTRADICTION = 20.0
@@ -203,7 +203,7 @@ def find_row_tones(places: FramePlaces, axis: int, highest: float) -> RowTones:
             break
         trial = min(tried, key=lambda fit: fit.cost)
         spare = float(places.measurements.num_measurements[0, axis]) - len(trial.values)
-        needed = max(F_THRESHOLD * 4 * trial.cost / max(spare, 1.0), MIN_SHARE * found.cost)
+        needed = max(F_THRESHOLD * 4 * trial.cost / max(spare, 1.0), _MIN_SHARE * found.cost)
         if spare < len(trial.values) or found.cost - trial.cost <= needed:
             break
         found = trial
@@ -309,7 +309,7 @@ def row_time_of_tones(
     # all of them give nearly the same displacements; low frequencies, of long row times, blur the frames least
     starts = sorted((one.row_time for one in _as_good_as_the_first(possible)), key=abs, reverse=True)
     tried, results = list[float](), list[RowTimeFit]()
-    while starts and len(tried) < MAX_STARTS:
+    while starts and len(tried) < _MAX_STARTS:
         tried.append(starts.pop(0))
         measured = _measured_with(tried[-1], turned(stack, tried[-1]), clock, options, tones)
         if measured is None:
@@ -343,7 +343,7 @@ def _possible(tones: list[RowTones], clock: CameraClock, direction: float = 1.0)
 
 
 def _as_good_as_the_first(possible: list[Candidate]) -> list[Candidate]:
-    return [one for one in possible if one.chi_square <= possible[0].chi_square + MAX_CHI_SQUARE]
+    return [one for one in possible if one.chi_square <= possible[0].chi_square + _MAX_CHI_SQUARE]
 
 
 def _tones_at(tones: list[RowTones], row_time: float, period: float) -> tuple[Array, Array]:

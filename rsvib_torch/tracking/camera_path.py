@@ -453,6 +453,15 @@ class _WindowFit:
 
         self.tones = [tone for tone, wave in zip(self.tones, waves, strict=True) if is_kept(tone, wave)]
 
+    def path(self, other_readout: tuple[str, float, float] | None = None, *, is_of_other: bool = False) -> WindowPath:
+        """The result of the fit; the arguments are those of ``WindowPath``."""
+        knots = self.knots.T / np.array([1.0, 1.0, self.reach, self.reach])
+        residual = residual_of_most = float(np.median(self.distance)) / _HALF
+        if not self.layer.all():  # with a subject on 40 % of the frame, tones of 0.1 px were found that are none
+            residual_of_most = float(np.quantile(self.distance, 0.8)) / _FOUR_FIFTHS
+        of_window, of_fit = (self.origin, self.start, self.step, knots, tuple(self.tones)), (residual, residual_of_most)
+        return WindowPath(*of_window, *of_fit, other_readout, is_of_other)
+
     def is_apart_from(self, frequency: float, others: Array) -> NDArray[np.bool_]:
         """Whether other frequencies are not those of a tone, nor of a change of its amplitude."""
         resolved = max(2.0 / (self.times.max() - self.times.min()), 0.5 / self.envelope_step)
@@ -545,8 +554,8 @@ def distances_left(
     return fit.distance
 
 
-def _with_other_readout(fit: _WindowFit, readout: float) -> tuple[tuple[str, float, float] | None, _WindowFit]:
-    """``WindowPath.other_readout``, and the fit: that with the other readout where it has another path.
+def _compared_readouts(fit: _WindowFit, readout: float) -> WindowPath:
+    """The path of a fit, or that with another readout which has another path, and ``WindowPath.other_readout``.
 
     At another readout, a tone continues from frame to frame as its alias with the same phase within a frame.
     """
@@ -566,7 +575,7 @@ def _with_other_readout(fit: _WindowFit, readout: float) -> tuple[tuple[str, flo
             # rows that are read the other way, or all at once, are displaced along another path
             limit, best = other.unexplained, other if part <= 0.0 else fit
             found = name, math.sqrt(fit.unexplained), math.sqrt(limit)
-    return found, best
+    return best.path(found, is_of_other=best is not fit)
 
 
 def fit_window(
@@ -576,8 +585,8 @@ def fit_window(
     readout: float,
     has_tones: bool = True,
     slopes: Sequence[float] | Array = (0.0,),
-) -> WindowPath:
-    """Path and tones of the ``corners`` of all pairs of a window of frames, which are an ``interval`` in s apart.
+) -> _WindowFit:
+    """Fit of path and tones to the ``corners`` of all pairs of a window of frames, an ``interval`` in s apart.
 
     A corner is displaced by the mean of the displacement over the times ``averaged``; the ``readout`` takes from the
     first to the last row (s). Without ``has_tones``, no tones are looked for; ``slopes`` in Hz/s are those of tones.
@@ -626,15 +635,7 @@ def fit_window(
         changed = fit.with_distinct_tones(limits)
         if changed is not None:
             fit, number = changed, -1
-    other_readout, best = (None, fit) if not has_tones or len(slopes) > 1 else _with_other_readout(fit, readout)
-    is_of_other, fit = best is not fit, best
-    knots = fit.knots.T / np.array([1.0, 1.0, fit.reach, fit.reach])
-    residual = residual_of_most = float(np.median(fit.distance)) / _HALF
-    if not fit.layer.all():  # with a subject on 40 % of the frame, tones of 0.1 px were found that are none
-        residual_of_most = float(np.quantile(fit.distance, 0.8)) / _FOUR_FIFTHS
-    return WindowPath(
-        fit.origin, fit.start, fit.step, knots, tuple(fit.tones), residual, residual_of_most, other_readout, is_of_other
-    )
+    return fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -701,7 +702,8 @@ def camera_path(
     def fit() -> None:
         known = [pair for pair in waiting if pair is not None]
         if len(known) >= max(2, len(waiting) // 4):
-            window = fit_window(Corners.joined(known), timing.frame_period, averaged, readout, has_tones)
+            found = fit_window(Corners.joined(known), timing.frame_period, averaged, readout, has_tones)
+            window = _compared_readouts(found, readout) if has_tones else found.path()
             windows.extend(swept(window) or [window])
 
     def swept(window: WindowPath) -> list[WindowPath]:
@@ -717,7 +719,7 @@ def camera_path(
                 return []
             joined = Corners.joined(known)
             if not windows or joined.times.mean() > windows[-1].origin:
-                found.append(fit_window(joined, timing.frame_period, averaged, readout, slopes=_SLOPES))
+                found.append(fit_window(joined, timing.frame_period, averaged, readout, slopes=_SLOPES).path())
         least = (1.2 if continued else 0.5) * window.residual
         if window.other_readout is not None:  # tones that sweep explain less than the other readout does
             least = min(least, window.other_readout[2] / _HALF)

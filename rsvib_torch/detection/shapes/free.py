@@ -421,7 +421,7 @@ def _fit_spline(
         values, of_rows = measurements.displacements[0, ..., axis] * seen, measurements.inverse_variances[0, :, axis]
         weighted, energy = of_rows[:, None] * values, float((of_rows[:, None] * np.square(values)).sum())
         right = np.bincount(index.ravel(), (weights * weighted[..., None]).ravel(), count)
-        (band,) = normal_bands(index, weights, seen, of_rows[None], count)
+        band = _normal_band(index, weights, seen, of_rows, count)
         # 3. Their solution.
         known = max(float(measurements.num_measurements[0, axis]), 1.0)
         value, covariance = _solved_spline(band, right, energy, known, mean)
@@ -430,16 +430,16 @@ def _fit_spline(
     return _SplineFit(np.stack(coefficients), first, spacing, covariances)
 
 
-def normal_bands(index: Array, weights: Array, seen: Array, row_weights: Array, count: int) -> Array:
-    """Lower bands (A, D, N) of the normal matrices of N = ``count`` coefficients for values relative to their group.
+def _normal_band(index: Array, weights: Array, seen: Array, row_weights: Array, count: int) -> Array:
+    """Lower band (D, N) of the normal matrix of N = ``count`` coefficients for values relative to their group.
 
     The value of a row in a frame depends on the coefficients ``index`` (R, G, M) by the factors ``weights``. ``seen``
-    (R, G) is 1 where a frame contains the row, else 0; ``row_weights`` (A, R) are those of the rows in each matrix.
+    (R, G) is 1 where a frame contains the row, else 0; ``row_weights`` (R,) are those of the rows.
     """
     inside = seen[..., None] > 0
     first = np.minimum(np.where(inside, index, count - 1).min((1, 2)), count - 1)
     index = np.where(inside, index, first[:, None, None])
-    bands = np.zeros((len(row_weights), int(np.ptp(index, (1, 2)).max()) + 1, count))
+    band = np.zeros((int(np.ptp(index, (1, 2)).max()) + 1, count))
     for part in runs(len(seen), 32):  # rows at a time, with the coefficients that they depend on
         used, place = np.unique(index[part], return_inverse=True)
         visible = seen[part, :, None]
@@ -448,11 +448,10 @@ def normal_bands(index: Array, weights: Array, seen: Array, row_weights: Array, 
         design = design.reshape(*visible.shape[:2], -1) * visible
         design -= visible * (design.sum(1, keepdims=True) / np.maximum(visible.sum(1, keepdims=True), 1.0))
         apart = used[:, None] - used
-        within = (apart >= 0) & (apart < bands.shape[1])
-        for band, weight in zip(bands, row_weights[:, part], strict=True):
-            gram = (design * weight[:, None, None]).reshape(visible.size, -1).T @ design.reshape(visible.size, -1)
-            band[apart[within], np.broadcast_to(used, apart.shape)[within]] += gram[within]
-    return bands
+        within = (apart >= 0) & (apart < len(band))
+        gram = (design * row_weights[part, None, None]).reshape(visible.size, -1).T @ design.reshape(visible.size, -1)
+        band[apart[within], np.broadcast_to(used, apart.shape)[within]] += gram[within]
+    return band
 
 
 def _solved_spline(

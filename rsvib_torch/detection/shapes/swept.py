@@ -52,7 +52,7 @@ _STARTS = 7.5  # starts over the squared number of periods of the highest freque
 _MAX_STARTS = 100_000  # the search takes 0.5 s for frames of 266 rows; a part of the record has fewer
 # probability; of 96 axes of frames of noise, 54 were reliable without this limit and 0 of 60 with it
 _MAX_CHANCE = 0.01
-_LARGEST = 1e3  # px, displacement of a fit
+_LARGEST = 1e3  # px, of a fit to any motion that is searched for; a fit to frames of noise grew to 36,000 px
 _MOST_STEPS = 25  # evaluations of a fit from one start
 # factors of the parameters [a, b, f, g, c, v]: of the same tone with the opposite frequency, and of no tone
 _MIRRORED, _STILL = np.array([1.0, -1.0, -1.0, 1.0, -1.0, 1.0]), np.array([0.0, 0.0, 1.0, 1.0, 1.0, 1.0])
