@@ -334,7 +334,7 @@ _SHAPES = {
         "path and tones leave {value:.2g} px of the motion of corners, and {limit:.2g} px if the rows are read {other}",
         "check row_time and the readout direction",
         "residual of the corners of a video with the stated and with another readout, whose square is smaller by a "
-        "sixth or more",
+        "tenth or more",
     ),
     "motion_unexplained": _px(
         "rows move by {value:.3g} px that no {model} explains, {limit:.2g} px are allowed",

@@ -2,7 +2,7 @@
 
 Each row of a frame shows the path of the camera at another time. At the right row time, one smooth path explains the
 displacements of the corners in all rows; at other row times it leaves more of them. The path has roll and zoom, and
-corners that move by themselves have little weight (``tracking.camera_path``), so that frames with parallax can be used.
+corners that move by themselves have little weight (``tracking.window_fit``), so that frames with parallax can be used.
 """
 
 import itertools
@@ -19,7 +19,7 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.registration.corners import CornerFollower, Corners, eight_bits
 from rsvib_torch.row_time.by_tones import CameraClock, RowTimeFit
-from rsvib_torch.tracking.camera_path import WindowPath, averaging, distances_left, fit_window
+from rsvib_torch.tracking.window_fit import WindowPath, averaging, distances_left, fit_window
 
 _MAX_STD = 0.05  # of the row time; a twentieth of what the rows are displaced by remains in restored frames
 _ROUGH = 0.25  # of the row time, standard deviation up to which a result is stated

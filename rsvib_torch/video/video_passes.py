@@ -35,15 +35,8 @@ from rsvib_torch.stacks.job import stored_frame
 from rsvib_torch.stacks.recorded_motion import compared_pairs
 from rsvib_torch.stacks.window_restoration import pair_verdict
 from rsvib_torch.stacks.windows import WindowRecord, record_fields
-from rsvib_torch.tracking.camera_path import (
-    SIGNIFICANT,
-    WINDOW_FRAMES,
-    CameraPath,
-    Tone,
-    WindowPath,
-    camera_path,
-    shake,
-)
+from rsvib_torch.tracking.camera_path import WINDOW_FRAMES, CameraPath, camera_path, shake
+from rsvib_torch.tracking.window_fit import SIGNIFICANT, Tone, WindowPath
 from rsvib_torch.video import Margins
 from rsvib_torch.video.recorded_rotation import RecordedRotation
 from rsvib_torch.video.steadying import steady_shifts

@@ -1,0 +1,138 @@
+"""Whether another readout of the rows explains the corners of a window of frames better than the stated one.
+
+A wave displaces the rows of a frame with one frequency, which the readout determines, and continues from frame to frame
+with another one, which does not depend on the readout. With the right readout, the two agree up to a multiple of the
+frame rate. With another one, the wave can seem to be a tone of another frequency, and the path of the camera, which
+must fit as well, decides.
+"""
+
+import math
+from copy import copy
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from rsvib_torch.numerics.tables import Array
+from rsvib_torch.tracking.window_fit import MIN_RATIO, ROUNDS, SearchedFrequencies, WindowFit, WindowPath
+
+_WITHOUT_TONES = 0.5, 0.7, 1.4, 2.0  # parts of the time of a readout that are compared where there are no tones
+_LEAST_PART, _MOST_PART = 0.4, 2.5  # of those that tones propose; row times are guessed from the frame rate or a table
+# By how much the square of what the path leaves is less if the stated readout is wrong. 55 clips in H.264, a phone, and
+# a drone: at most 1.06 with the right row time, but for 1.20 and 1.33 where corners are few or not explained; 1.19 to 5
+# with 16 wrong ones, 0.5 to 2 times the right one, which tones then propose within 0.5 %
+_CONTRADICTED = 1.12
+# Of the frame rate, by which the frequency within a frame is changed to find that of a wave
+_COARSE, _FINE = np.array([-0.375, -0.125, 0.125, 0.375]), np.arange(-4, 5) / 8
+_SAME_PART = 0.005  # between parts, which turns a tone of five periods within a frame by 5 degrees at its ends
+_HARMLESS = 0.05  # difference of a readout that leaves a twentieth of the displacement of the rows
+_SAME_WAVE = 0.02  # periods per frame, between frequencies from frame to frame
+
+
+@dataclass(frozen=True)
+class _Wave:
+    """A wave of the rows of one axis."""
+
+    axis: int  # 0: x, 1: y
+    frequency: float  # Hz, from frame to frame, up to a multiple of the frame rate
+    within: float  # Hz, within a frame by the stated readout
+
+    def alias(self, part: float, interval: float) -> float:
+        """Frequency in Hz of the tone that it is if the readout takes this part of the time."""
+        return self.frequency + round((self.within / part - self.frequency) * interval) / interval
+
+    def parts(self, interval: float) -> list[float]:
+        """Parts of the time of a readout with which it is one tone."""
+        turns = np.arange(
+            math.ceil((self.within / _MOST_PART - self.frequency) * interval),
+            (self.within / _LEAST_PART - self.frequency) * interval,
+        )
+        return [float(self.within / alias) for alias in self.frequency + turns / interval if alias > 0]
+
+
+def _strongest_wave(fit: WindowFit, axis: int, readout: float) -> _Wave | None:
+    """The wave of an axis that explains most beside the path, if it is significant."""
+    rest, grid, rate = copy(fit), fit.searched(readout), 1.0 / fit.interval
+    rest.tones = []
+
+    def best(searched: SearchedFrequencies, parts: Array) -> list[tuple[float, float, float, float]]:
+        """Sum of squares that a wave explains, its frequencies, and its ratio, for parts of the frame rate."""
+        found = []
+        for part in parts:
+            wave, ratio, offsets = rest.strongest(axis, searched, searched.is_visible, turns=part * rate * readout)
+            found.append((offsets**2, wave, wave + part * rate, ratio))
+        return found
+
+    # 1. Its frequency from frame to frame is that of the strongest tone, or of the strongest of all waves.
+    tones = [tone for tone in fit.tones if tone.axis == axis]
+    if tones:
+        largest = max(tones, key=lambda tone: float(np.abs(tone.knots).mean()))
+        frequency, part = largest.frequency, 0.0
+    else:
+        _, frequency, within, ratio = max(best(grid, _COARSE))
+        part = (within - frequency) / rate
+        if ratio < MIN_RATIO:
+            return None
+    # 2. What it explains is a parabola over its frequency within a frame, around the highest value.
+    near = frequency + grid.step * np.arange(-3, 4)
+    close = replace(grid, frequencies=near, is_visible=np.ones(len(near), bool))
+    found = best(close, part + _FINE)
+    number = min(max(int(np.argmax([squares for squares, *_ in found])), 1), len(found) - 2)
+    before, top, after = (squares for squares, *_ in found[number - 1 : number + 2])
+    shift = 0.5 * (after - before) / max(2.0 * top - after - before, 1e-30)
+    step = (_FINE[1] - _FINE[0]) * rate
+    return _Wave(axis, frequency, frequency + (part + _FINE[number]) * rate + step * float(np.clip(shift, -1.0, 1.0)))
+
+
+def _waves(fit: WindowFit, readout: float) -> list[_Wave]:
+    """The waves of the rows, one for tones that are aliases of each other."""
+    if not fit.tones:
+        return []
+    waves = [wave for axis in (0, 1) if (wave := _strongest_wave(fit, axis, readout)) is not None]
+    for tone in fit.tones:
+        apart = [(tone.frequency - wave.frequency) * fit.interval for wave in waves if wave.axis == tone.axis]
+        if all(abs(turns - round(turns)) > _SAME_WAVE for turns in apart):
+            waves.append(_Wave(tone.axis, tone.frequency, tone.frequency))
+    return waves
+
+
+def compared_readouts(fit: WindowFit, readout: float) -> WindowPath:
+    """The path of a fit, or that with another readout which has another path, and ``WindowPath.other_readout``.
+
+    The stated ``readout`` takes from the first to the last row, in s.
+    """
+    waves, interval = _waves(fit, readout), fit.interval
+
+    def with_part(part: float, rounds: int) -> WindowFit:
+        moved = (1.0 - part) * readout * (fit.corners.rows - 0.5)
+        other = WindowFit(replace(fit.corners, times=fit.corners.times - moved[:, None]), interval, fit.averaged)
+        if part > 0.0:
+            other.add_tones(sorted({(wave.axis, wave.alias(part, interval)) for wave in waves}))
+        other.layer, other.weights = fit.layer, fit.weights
+        other.solve(rounds)
+        return other
+
+    # 1. The readouts with which each wave is one tone, without those at which all tones are as with the stated readout.
+    proposed = sorted(part for wave in waves for part in wave.parts(interval)) if waves else _WITHOUT_TONES
+    parts = [
+        part
+        for before, part in pairwise((-1.0, *proposed))
+        if part > (1.0 + _SAME_PART) * before
+        and (
+            abs(part - 1.0) > _HARMLESS
+            or any(wave.alias(part, interval) != wave.alias(1.0, interval) for wave in waves)
+        )
+    ]
+    # 2. The best of them after one round, from the weights of the stated readout, must leave less in a robust fit.
+    left = {part: with_part(part, 1).unexplained for part in (-1.0, 0.0, *parts)}
+    part = min(left, key=lambda one: left[one])
+    other = with_part(part, ROUNDS)
+    if other.unexplained * _CONTRADICTED > fit.unexplained:
+        return fit.path()
+    # 3. It may do so by waves that have not been found as tones with the stated readout.
+    if other.unexplained * _CONTRADICTED > with_part(1.0, ROUNDS).unexplained:
+        return fit.path()
+    name = {-1.0: "in reverse", 0.0: "all at once"}.get(part, f"in {part:.2f} times the time")
+    found = name, math.sqrt(fit.unexplained), math.sqrt(other.unexplained)
+    # Rows that are read the other way, or all at once, are displaced along another path.
+    return (other if part <= 0.0 else fit).path(found, is_of_other=part <= 0.0)

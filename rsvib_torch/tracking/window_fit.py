@@ -1,0 +1,619 @@
+"""The path of a camera and its vibration in a window of frames, from corners that are followed from frame to frame.
+
+A corner at the place p (px from the centre of the frame) is exposed at the time t of its row. Between two frames it is
+displaced by ``B(p) (P(t') - P(t)) + V(t') - V(t)``. The path P has the components x, y (px), roll (rad) and zoom, with
+``B(p) = [[1, 0, -p_y, p_x], [0, 1, p_x, p_y]]``; the vibration V is a sum of tones along x and y. P is a cubic B-spline
+with two knots per frame, which follows a hand. The amplitude and phase of a tone are a spline with a knot every four
+frames, which follows a vibration that decays or grows. Tones are found in a periodogram from which everything that P
+explains has been projected out. Both are fitted together, with weights that leave out moving objects: at first all that
+is not of the layer of the corners, which a subject on 40 % of the frame would move the fit away from.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from copy import copy
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded, solve_triangular
+
+from rsvib_torch.numerics.splines import spline_taps
+from rsvib_torch.numerics.tables import Array
+from rsvib_torch.registration.corners import Corners, reduction
+
+_MOST_TONES = 3  # of an axis in a window
+_KNOTS = 2  # of the spline per frame; with one, residuals of hand-held clips are 1.7 times as large
+_STIFFNESS = 1e-3  # of the third difference of the spline, in units of the information of a typical knot
+_LEAST = 1e-9  # information of what is not determined, likewise
+_FAST = 10.0  # Hz/s, from which on a tone is at a blind frequency for a moment only
+_ENVELOPE = 4  # frames between the knots of a tone; a blow that decays with 0.3 s is followed at 30 frames per second
+_STEADY = 0.1  # of a tone, by which neighbouring knots differ (standard deviation), where corners do not determine it
+_CELLS = 24  # of the rows, in which the search for tones takes means; resolves tones of 12 periods per readout
+_FINE = 64  # frequencies that are compared at a time
+MIN_RATIO = 60.0  # of the variance that a tone explains and that of the rest; compression and parallax reach 40
+_MIN_EXPLAINED = 0.03  # px rms, of the offsets that a tone explains; smaller ones are not visible in a video
+_LOWEST = 0.6  # of the frame rate; the path follows slower motion
+_HIGHEST = 2000.0  # Hz; rows that are read nearly at once would resolve any frequency, and the search would not end
+_MIN_GAIN = 0.15  # |2 sin(pi f T)|; tones close to a multiple of the frame rate hardly change from frame to frame
+# Tones of at most this gain of which more is left in a third of the rows are left out: 0.1 to 0.8 of 20 of 24 tones by
+# objects that move in some rows, below 0.03 of tones of cameras at such frequencies
+_NEARLY_BLIND, _MAX_APART = 0.5, 0.1
+SIGNIFICANT = 3.0  # standard deviations of a tone
+_MIN_SHARE = 2e-3  # of the largest variance that a tone of 1 px causes; others are hidden by the path
+_MIN_SINC = 0.1  # of the amplitude that remains in the mean over the exposure
+# rows of the patch of a corner, over which its displacement is a mean: amplitudes of 52 to 205 Hz are then right within
+# 1 to 2 %, and 2 to 15 % too small without
+_PATCH_ROWS = 10
+_ALIASES = 2  # frequencies on each side of a tone that are compared with it
+# of what the best of them leaves, that the next one leaves at least: 1.12 and more of 24 right tones; 1.00 to 1.07 of
+# tones by noise, bars and texts beside the picture, and where a quarter of the rows has corners
+_DISTINCT = 1.08
+# turns, by which the phase of a tone drifts over a window without noise: frequencies of 48 tones in H.264 were wrong by
+# 0.003 to 0.005 Hz, 2 to 4 standard deviations of noise
+_DRIFT = 0.012
+ROUNDS = 4  # of a robust fit
+_HALF, _FOUR_FIFTHS = 1.177, 1.794  # standard deviations, below which that part of lengths of two normal components is
+# Residual of the path of a layer over that of all corners, before tones are found: 0.07 to 0.63 beside a subject on 20
+# to 40 % of the frame, 0.98 to 2.3 in clips with tones of 1.5 to 5 px
+_EXPLAINS_MORE = 0.8
+_SOFT = 3.0  # standard deviations, at which a corner has a quarter of the weight
+
+
+Averaged = tuple[float, float]  # s, the exposure, and the time in which the rows of the patch of a corner are read
+
+
+@dataclass(frozen=True, eq=False)
+class Tone:
+    """A tone of one axis of the vibration around a time."""
+
+    axis: int  # 0: x, 1: y
+    frequency: float  # Hz
+    coefficient: complex  # px; the displacement is Re c exp(2 pi i f t)
+    amplitude_std: float  # px
+    frequency_std: float  # Hz
+
+
+@dataclass(eq=False)
+class WindowTone:
+    """A tone of one axis in a window, whose amplitude and phase change slowly; times count from its middle."""
+
+    axis: int  # 0: x, 1: y
+    frequency: float  # Hz
+    # (M,) px, coefficients of a spline c(t); the displacement is Re c(t) exp(2 pi i f t)
+    knots: NDArray[np.complex128]
+    start: float  # s, of the first knot
+    step: float  # s, between knots
+    slope: float = 0.0  # Hz/s, by which the frequency changes
+    amplitude_std: float = math.inf  # px
+    frequency_std: float = math.inf  # Hz
+    apart: float = 0.0  # largest part of the tone that is left in a third of the rows
+
+    def at(self, time: float, origin: float, weight: float = 1.0) -> Tone:
+        """The tone as it is at a time in s, with the time origin of its phase, multiplied by a weight."""
+        index, factors = spline_taps(np.array([time]), self.start, self.step, len(self.knots))
+        frequency = self.frequency + self.slope * time
+        turns = frequency * origin - 0.5 * self.slope * time**2
+        turned = (factors * self.knots[index]).sum() * np.exp(2j * math.pi * turns)
+        # What a spline does not follow: behind a blow that decays with 0.1 s, amplitudes were wrong by 6 to 20 std.
+        bent = 0.25 * float(np.abs(np.diff(self.knots[index.min() : index.max() + 1], 2)).max())
+        bent = math.sqrt(max(bent**2 - 0.375 * min(self.amplitude_std, 1e9) ** 2, 0.0))  # without that of noise
+        size_std = math.hypot(self.amplitude_std, bent)
+        phase = bent / max(abs(turned), bent, 1e-30)
+        rate_std = math.hypot(self.frequency_std, phase / (2 * math.pi * self.step * (len(self.knots) - 3)))
+        return Tone(self.axis, frequency, complex(weight * turned), weight * size_std, rate_std)
+
+    def waves(self, times: Array, averaged: Averaged) -> NDArray[np.complex128]:
+        """Values at times, averaged over the exposure and the patch of a corner, of an amplitude of 1."""
+        frequency = self.frequency + self.slope * times if self.slope else np.array(self.frequency)
+        attenuation = np.prod([np.sinc(frequency * seconds) for seconds in averaged], 0)
+        return np.asarray(attenuation * np.exp(1j * math.pi * (self.frequency + frequency) * times))
+
+    def correct_frequency(self, limit: float) -> None:
+        """Change the frequency, by at most ``limit`` in Hz, so that the phase of the knots stays the same.
+
+        That of a tone that sweeps changes by as much at the ends of the window, in opposite directions.
+        """
+        turned = self.knots[1:] * self.knots[:-1].conj()
+        mean = turned.sum()  # weighted by size
+        times = self.start + self.step * (np.arange(len(self.knots)) - 1)
+        middles = 0.5 * (times[1:] + times[:-1])
+        change = float(np.clip(np.angle(mean) / (2 * math.pi * self.step), -limit, limit))
+        slope = 0.0
+        if self.slope:
+            weight = np.abs(turned)
+            bent = (weight * middles) @ np.angle(turned * np.conj(mean)) / (2 * math.pi * self.step)
+            slope = float(np.clip(bent / max(weight @ middles**2, 1e-30), -limit / middles[-1], limit / middles[-1]))
+        self.frequency, self.slope = self.frequency + change, self.slope + slope
+        self.knots = self.knots * np.exp(-1j * math.pi * (2 * change + slope * times) * times)
+
+    def set_std(self, covariance: Array) -> None:
+        """Standard deviations, from the covariance (2 M, 2 M) of the real and the imaginary parts of the knots."""
+        count = len(self.knots)
+        variance = covariance.diagonal()
+        self.amplitude_std = math.sqrt(max(np.median(variance[:count]), np.median(variance[count:])))
+        weight = np.square(np.abs(self.knots))
+        times = self.step * np.arange(count)
+        times -= weight @ times / max(float(weight.sum()), 1e-30)
+        spread = float(weight @ np.square(times))
+        # The slope of the phase is sum(|c|^2 t phi) / sum(|c|^2 t^2), and phi changes by Im(dc / c).
+        gradient = np.concatenate([-times * self.knots.imag, times * self.knots.real])
+        noise = math.sqrt(max(gradient @ covariance @ gradient, 0.0)) / (2 * math.pi * max(spread, 1e-30))
+        self.frequency_std = math.hypot(noise, _DRIFT / (self.step * (count - 3)))
+
+
+@dataclass(frozen=True, eq=False)
+class SearchedFrequencies:
+    """Frequencies above those that a path follows, up to those that rows resolve."""
+
+    frequencies: Array  # (F,) Hz
+    step: float  # Hz, between them
+    is_resolved: NDArray[np.bool_]  # (F,), whether the exposure leaves a tone of this frequency
+    is_visible: NDArray[np.bool_]  # (F,), and whether it changes from frame to frame
+
+    @property
+    def limits(self) -> Array:
+        """Hz, the lowest and the highest frequency that is visible."""
+        return self.frequencies[self.is_visible][[0, -1]] if self.is_visible.any() else np.zeros(2)
+
+
+@dataclass(frozen=True, eq=False)
+class WindowPath:
+    """Path and tones in one window of frames."""
+
+    origin: float  # s, the time origin of the tones: the middle of the window
+    start: float  # s, of the first knot
+    step: float  # s, between knots
+    knots: Array  # (N, 4) coefficients of the spline
+    tones: tuple[WindowTone, ...]
+    residual: float  # px, robust standard deviation of the offsets of corners along one axis
+    residual_of_most: float  # px, likewise; where the path is that of a layer, from four fifths of all corners
+    # how the rows are read instead, if the corners contradict the stated readout, and px, median residuals by the path
+    # with the stated and with this readout
+    other_readout: tuple[str, float, float] | None
+    is_of_other: bool  # whether the path is that with this readout, because its rows are displaced along another path
+
+    def path(self, times: Array, derivative: int = 0) -> Array:
+        """(N, 4) components of the path, or their derivatives, at times (N,) in s."""
+        index, weights = spline_taps(times, self.start, self.step, len(self.knots), derivative=derivative)
+        return np.einsum("nk,nka->na", weights, self.knots[index])
+
+
+def _basis(index: NDArray[np.int64], factors: Array, count: int) -> Array:
+    """(N, 2, count) B-splines from ``spline_taps`` at both times (N, 2)."""
+    basis = np.zeros((*index.shape[:2], count))
+    np.put_along_axis(basis, index, factors, -1)
+    return basis
+
+
+def _differences(index: NDArray[np.int64], factors: Array, count: int) -> Array:
+    """(N, count), differences between both times (N, 2) of the B-splines from ``spline_taps``."""
+    basis = _basis(index, factors, count)
+    return np.asarray(basis[:, 1] - basis[:, 0])
+
+
+def _gain(frequency: Array | float, interval: float) -> Array:
+    """Offset from frame to frame by a tone of amplitude 1."""
+    return np.asarray(np.abs(2 * np.sin(math.pi * frequency * interval)))
+
+
+def _wave_columns(waves: NDArray[np.complex128], values: Array) -> Array:
+    """(N, 2 M) offsets between both times of waves (N, 2), by the real and imaginary parts of M knots (N, 2, M)."""
+    late, early = (waves[:, time, None] * values[:, time] for time in (1, 0))
+    return np.concatenate([(late - early).real, (early - late).imag], -1)
+
+
+def robust_weights(distance: Array, std: Array | float) -> Array:
+    """Weights of residuals of the size ``distance`` with standard deviations, which are at least 0.001 px."""
+    return 1.0 / (1.0 + (distance / (_SOFT * np.maximum(std, 1e-3))) ** 2) ** 2
+
+
+@cache
+def _squared_differences(count: int, order: int) -> Array:
+    """Matrix (count, count) of the sum of the squares of the differences of some ``order`` between neighbours."""
+    differences = np.diff(np.eye(count), order, axis=0)
+    return np.asarray(differences.T @ differences)
+
+
+class _Band:
+    """Normal equations whose matrix is a band: ``matrix[i - j, j]`` is the entry of row i and column j, i >= j."""
+
+    def __init__(self, blocks: Sequence[NDArray[np.int64]], count: int) -> None:
+        """Equations of ``count`` unknowns; each of the blocks lists those that its entries depend on."""
+        self.blocks, self.parts = blocks, list[tuple[NDArray[np.int64], NDArray[np.int64]]]()
+        self.matrix, self.right = np.zeros((1 + max(int(np.ptp(index)) for index in blocks), count)), np.zeros(count)
+        for index in blocks:
+            row, column = np.nonzero(index[:, None] >= index)
+            place = (index[row] - index[column]) * count + index[column]
+            self.parts.append((row * len(index) + column, place))
+
+    def clear(self) -> None:
+        """Begin with no equations."""
+        self.matrix[:] = self.right[:] = 0.0
+
+    def add(self, number: int, columns: Array, values: Array, weights: Array) -> None:
+        """Add the equations ``columns @ unknowns = values`` of a block (C-contiguous matrices)."""
+        heavy, (inside, place) = columns.T * weights, self.parts[number]
+        self.matrix.reshape(-1)[place] += (heavy @ columns).reshape(-1)[inside]
+        self.right[self.blocks[number]] += heavy @ values
+
+    def stiffen(self, index: NDArray[np.int64], order: int, weight: float) -> None:
+        """Keep the differences of some ``order`` between neighbouring unknowns, with rising numbers, small."""
+        squares = _squared_differences(len(index), order)
+        for apart in range(order + 1):
+            later, earlier = index[apart:], index[: len(index) - apart]
+            self.matrix[later - earlier, earlier] += weight * squares.diagonal(apart)
+
+    def solve(self) -> tuple[Array, Callable[[Array], Array]]:
+        """The unknowns, and a function that solves for other right sides."""
+        factor = cholesky_banded(self.matrix, lower=True, check_finite=False), True
+        return cho_solve_banded(factor, self.right), lambda right: np.asarray(cho_solve_banded(factor, right))
+
+
+class WindowFit:
+    """The robust fit of path and tones to the corners of one window."""
+
+    def __init__(self, corners: Corners, interval: float, averaged: Averaged) -> None:
+        self.corners, self.interval, self.averaged = corners, interval, averaged
+        self.step = interval / _KNOTS
+        self.start, end = float(corners.times.min()), float(corners.times.max())
+        self.origin = 0.5 * (self.start + end)
+        self.count = math.ceil((end - self.start) / self.step) + 3
+        self.times = corners.times - self.origin
+        # Roll and zoom are fitted as the displacement in px at the farthest corner.
+        self.reach = max(1.0, float(np.abs(corners.places).max()))
+        index, weights = spline_taps(corners.times, self.start, self.step, self.count)
+        factors = corners.factors / np.array([1.0, 1.0, self.reach, self.reach])
+        # Columns of the path, for the few knots that a pair of frames depends on: every component of a knot at the
+        # places of the corners.
+        self.pairs: list[tuple[slice, NDArray[np.int64], Array]] = []  # corners, unknowns, columns (2, n, unknowns)
+        self.envelope_step = _ENVELOPE * interval
+        self.envelope_knots = max(4, math.ceil((end - self.start) / self.envelope_step) + 3)
+        taps = self._envelope(self.times)
+        self.envelopes: list[tuple[NDArray[np.int64], Array]] = []  # knots of a tone, and their values (n, 2, knots)
+        ends = np.append(np.nonzero(np.diff(corners.pairs))[0] + 1, len(factors))
+        for begin, stop in pairwise((0, *ends)):
+            part = slice(int(begin), int(stop))
+            low, knots = int(index[part].min()), int(index[part].max()) + 1
+            basis = _differences(index[part] - low, weights[part], knots - low)
+            columns = np.einsum("nac,nk->anck", factors[part], basis).reshape(2, len(basis), -1)
+            unknowns = (np.arange(4)[:, None] * self.count + np.arange(low, knots)).ravel()
+            self.pairs.append((part, unknowns, columns))
+            knots_of_tone = np.arange(taps[0][part].min(), taps[0][part].max() + 1)
+            self.envelopes.append(
+                (knots_of_tone, _basis(taps[0][part] - knots_of_tone[0], taps[1][part], len(knots_of_tone)))
+            )
+        self.tones: list[WindowTone] = []
+        self.layer, self.weights = np.ones(len(factors), bool), np.ones(len(factors))
+        self.sigma = math.inf  # px, standard deviation of a corner of the layer along one axis
+        self.distance = np.zeros(len(factors))  # px, of all corners from what is explained
+        self.unexplained = math.inf  # px^2, mean over the pairs of the square of the median residual
+        self.knots = np.zeros((4, self.count))
+
+    def explained(self, knots: Array) -> Array:
+        """(N, 2) px, offsets of the corners by a path with these knots (4, count)."""
+        offsets = np.empty_like(self.corners.offsets)
+        for part, unknowns, columns in self.pairs:
+            offsets[part] = (columns @ knots.ravel()[unknowns]).T
+        return offsets
+
+    def _envelope(self, times: Array) -> tuple[NDArray[np.int64], Array]:
+        """Knots of a tone at times in s from the middle, and their values."""
+        return spline_taps(times, self.start - self.origin, self.envelope_step, self.envelope_knots)
+
+    def solve(self, rounds: int = 2) -> None:
+        """Fit path and tones; each round corrects the weights and the frequencies."""
+        # Unknowns are numbered by the times of their knots, so that the normal matrix is a band.
+        knots = np.tile(self.step * np.arange(self.count), 4)
+        knots_of_tones = np.tile(self.envelope_step * np.arange(self.envelope_knots), 2 * len(self.tones))
+        place = np.argsort(np.argsort(np.concatenate([knots, knots_of_tones]), kind="stable"))
+        of_path, of_tones = place[: len(knots)], place[len(knots) :].reshape(len(self.tones), 2, self.envelope_knots)
+        blocks = [
+            np.concatenate([of_path[unknowns], of_tones[..., knots].ravel()])
+            for (_, unknowns, _), (knots, _) in zip(self.pairs, self.envelopes, strict=True)
+        ]
+        band = _Band(blocks, len(place))
+        for _ in range(rounds):
+            for tone in self.tones:
+                if tone.knots.any():
+                    tone.correct_frequency(0.25 / (self.times.max() - self.times.min()))
+            # 1. Columns of the path and the tones, for the few knots that a pair of frames depends on.
+            band.clear()
+            waves, columns = [tone.waves(self.times, self.averaged) for tone in self.tones], []
+            for number, ((part, _, path), (_, values)) in enumerate(zip(self.pairs, self.envelopes, strict=True)):
+                waving = np.zeros((len(self.tones), *path.shape[:2], 2 * values.shape[-1]))
+                for tone, wave, of_axis in zip(self.tones, waves, waving, strict=True):
+                    of_axis[tone.axis] = _wave_columns(wave[part], values)
+                columns.append(np.concatenate([path, *waving], -1).reshape(2 * path.shape[1], -1))
+                band.add(number, columns[-1], self.corners.offsets[part].T.ravel(), np.tile(self.weights[part], 2))
+            # 2. The solution with a stiff path, and tones that are steady where nothing determines them.
+            diagonal = band.matrix[0, of_path]
+            typical, mean = max(float(np.median(diagonal)), 1e-9), float(diagonal.mean())
+            band.matrix[0] += _LEAST * typical
+            for index in of_path.reshape(4, -1):
+                band.stiffen(index, 3, _STIFFNESS * typical)
+            for tone, parts in zip(self.tones, of_tones, strict=True):
+                spread = _STEADY * np.sqrt(np.square(np.abs(tone.knots)).mean())
+                for index in parts:
+                    band.stiffen(index, 1, (self.sigma / spread) ** 2 if spread > 0 else 1e-3 * mean)
+            solution, solved = band.solve()
+            self.knots = solution[of_path].reshape(4, -1)
+            # 3. Weights by the residuals, and the tones.
+            residual = self.corners.offsets.copy()
+            for (part, *_), index, of_pair in zip(self.pairs, blocks, columns, strict=True):
+                residual[part] -= (of_pair @ solution[index]).reshape(2, -1).T
+            self.distance = length = np.hypot(*residual.T)
+            self.sigma = max(float(np.median(length[self.layer])) / _HALF, 1e-3)
+            medians = self._medians(length)
+            self.weights = self._weights(length, self.sigma, medians / _HALF)
+            self.unexplained = float(np.square(medians).mean())
+            for tone, (real, imaginary) in zip(self.tones, solution[of_tones], strict=True):
+                tone.knots = real + 1j * imaginary
+        for tone, parts in zip(self.tones, of_tones, strict=True):
+            index = parts.ravel()
+            tone.set_std(self.sigma**2 * solved(np.eye(len(place))[:, index])[index])
+
+    def _medians(self, distance: Array) -> Array:
+        """Median of the layer of every pair of frames."""
+        return np.array([np.median(distance[part][self.layer[part]]) for part, *_ in self.pairs])
+
+    def _weights(self, distance: Array, std: float, of_pairs: Array) -> Array:
+        """Weights of residuals with a standard deviation, or that of their pair if it is larger.
+
+        A vibration that is not found yet displaces all corners of a pair.
+        """
+        counts = [part.stop - part.start for part, *_ in self.pairs]
+        return robust_weights(distance, np.repeat(np.maximum(std, of_pairs), counts))
+
+    def add_tones(self, tones: Sequence[tuple[int, float]], slope: float = 0.0) -> None:
+        """Add tones of some axes and frequencies to those that ``solve`` fits."""
+        for axis, frequency in tones:
+            knots = np.zeros(self.envelope_knots, complex)
+            tone = WindowTone(axis, frequency, knots, self.start - self.origin, self.envelope_step, slope)
+            self.tones.append(tone)
+
+    def with_tone(self, axis: int, frequency: float, slope: float) -> "WindowFit":
+        """The fit with one more tone."""
+        other = copy(self)
+        other.tones, other.weights = [*map(copy, self.tones)], self.layer.astype(np.float64)
+        other.add_tones([(axis, frequency)], slope)
+        other.solve(1)
+        return other
+
+    def with_aliases(self, axis: int, frequency: float, slope: float, limits: Array) -> list["WindowFit"]:
+        """The fit with a tone or one of its aliases between ``limits`` in Hz, the best first.
+
+        Frequencies one period per frame apart differ within the readout only, where the path follows a part of the
+        tone: they are compared by what remains of both axes.
+        """
+        aliases = frequency + np.arange(-_ALIASES, _ALIASES + 1) / self.interval
+        inside = (aliases > limits[0]) & (aliases < limits[1]) & self.is_apart(axis, aliases)
+        trials = [self.with_tone(axis, alias, slope) for alias in aliases[inside | (aliases == frequency)].tolist()]
+        return sorted(trials, key=lambda trial: trial.unexplained)
+
+    def with_distinct_tones(self, limits: Array) -> "WindowFit | None":
+        """The fit with a better alias of a tone, or without a tone that an alias explains as well; None without both.
+
+        As long as other tones are not known, they hide which alias leaves less.
+        """
+        for tone in self.tones:
+            rest = copy(self)
+            rest.tones = [other for other in self.tones if other is not tone]
+            best, *others = rest.with_aliases(tone.axis, tone.frequency, tone.slope, limits)
+            if others and others[0].unexplained < _DISTINCT * best.unexplained:
+                return rest
+            if abs(best.tones[-1].frequency - tone.frequency) * self.interval > 0.5:
+                return best
+        return None
+
+    def of_layer(self) -> "WindowFit":
+        """The path of the layer of the corners; this one, if it explains about as much of all corners.
+
+        A vibration of several px makes layers of the rows that move alike.
+        """
+        if self.corners.layer.all():
+            return self
+        other = copy(self)
+        other.layer, other.weights = self.corners.layer, self.corners.layer.astype(np.float64)
+        other.solve(ROUNDS)
+        return other if np.median(other.distance) < _EXPLAINS_MORE * np.median(self.distance) else self
+
+    def has_blind_tone(self) -> bool:
+        """Whether the frequency of a tone has been corrected to one that frames do not show."""
+        return any(_gain(tone.frequency, self.interval) < _MIN_GAIN for tone in self.tones if abs(tone.slope) <= _FAST)
+
+    def keep_tones(self) -> None:
+        """Leave out insignificant tones, and those near blind frequencies that thirds of the rows contradict."""
+        waves, residual = [], self.corners.offsets - self.explained(self.knots)
+        for tone in self.tones:
+            index, factors = self._envelope(self.times)
+            wave = tone.waves(self.times, self.averaged) * (factors * tone.knots[index]).sum(-1)
+            waves.append(wave[:, 1] - wave[:, 0])
+            residual[:, tone.axis] -= waves[-1].real
+        root = np.sqrt(self.weights)
+        thirds = (3 * self.corners.rows).astype(np.int64)
+        for tone, wave in zip(self.tones, waves, strict=True):
+            columns = root[:, None] * np.stack([wave.real, -wave.imag], -1)
+            left = root * residual[:, tone.axis]
+            fits = (np.linalg.lstsq(columns[thirds == third], left[thirds == third]) for third in range(3))
+            tone.apart = max(float(np.hypot(*solution)) for solution, *_ in fits)
+
+        def is_kept(tone: WindowTone, wave: NDArray[np.complex128]) -> bool:
+            least = _NEARLY_BLIND if tone.apart > _MAX_APART else _MIN_GAIN
+            is_visible = abs(tone.slope) > _FAST or _gain(tone.frequency, self.interval) > least
+            size = math.sqrt(np.square(np.abs(tone.knots)).mean())
+            return bool(
+                is_visible
+                and size > SIGNIFICANT * tone.amplitude_std
+                and 0.5 * np.square(np.abs(wave)).mean() > _MIN_EXPLAINED**2
+            )
+
+        self.tones = [tone for tone, wave in zip(self.tones, waves, strict=True) if is_kept(tone, wave)]
+
+    def path(self, other_readout: tuple[str, float, float] | None = None, *, is_of_other: bool = False) -> WindowPath:
+        """The result of the fit; the arguments are those of ``WindowPath``."""
+        knots = self.knots.T / np.array([1.0, 1.0, self.reach, self.reach])
+        residual = residual_of_most = float(np.median(self.distance)) / _HALF
+        if not self.layer.all():  # with a subject on 40 % of the frame, tones of 0.1 px were found that are none
+            residual_of_most = float(np.quantile(self.distance, 0.8)) / _FOUR_FIFTHS
+        of_window, of_fit = (self.origin, self.start, self.step, knots, tuple(self.tones)), (residual, residual_of_most)
+        return WindowPath(*of_window, *of_fit, other_readout, is_of_other)
+
+    def is_apart_from(self, frequency: float, others: Array) -> NDArray[np.bool_]:
+        """Whether other frequencies are not those of a tone, nor of a change of its amplitude."""
+        resolved = max(2.0 / (self.times.max() - self.times.min()), 0.5 / self.envelope_step)
+        return np.asarray(np.abs(others - frequency) > resolved)
+
+    def is_apart(self, axis: int, frequencies: Array) -> NDArray[np.bool_]:
+        """Whether frequencies are those of none of the tones of an axis."""
+        tones = (tone for tone in self.tones if tone.axis == axis)
+        return np.all([frequencies > 0, *(self.is_apart_from(tone.frequency, frequencies) for tone in tones)], axis=0)
+
+    def searched(self, readout: float) -> SearchedFrequencies:
+        """The frequencies of tones that are searched for, with the time of a readout in s."""
+        step = 0.3 / (self.times.max() - self.times.min())
+        frequencies = np.arange(_LOWEST / self.interval, min(0.5 * _CELLS / readout, _HIGHEST), step)
+        is_resolved = np.abs(np.prod(np.sinc(frequencies[:, None] * np.array(self.averaged)), 1)) > _MIN_SINC
+        is_visible = is_resolved & (_gain(frequencies, self.interval) > _MIN_GAIN)
+        return SearchedFrequencies(frequencies, step, is_resolved, is_visible)
+
+    def strongest(
+        self, axis: int, grid: SearchedFrequencies, wanted: NDArray[np.bool_], *, slope: float = 0.0, turns: float = 0.0
+    ) -> tuple[float, float, float]:
+        """The frequency that explains most of an axis, its ratio of variances, and the offsets by it (px rms).
+
+        It is one of those ``wanted`` of a grid of frequencies, all of which change by ``slope`` in Hz/s, and whose
+        phase advances by further ``turns`` from the first to the last row, but not from frame to frame.
+        """
+        # 1. Means of the offsets along the axis in cells of rows, without those by the other components.
+        others = self.knots.copy()
+        others[axis] = 0.0
+        offsets = (self.corners.offsets - self.explained(others))[:, axis]
+        row = np.clip(self.corners.rows * _CELLS, 0, _CELLS - 1).astype(np.int64)
+        _, cell = np.unique(self.corners.pairs * _CELLS + row, return_inverse=True)
+        # Corners far from the median of their cell do not count. The weights of the fit so far would also leave out
+        # what vibrates most, and another alias of the tone would explain the rest better.
+        order, sizes = np.lexsort((offsets, cell)), np.bincount(cell)
+        middle = np.cumsum(sizes) - sizes + (sizes - 1) // 2
+        apart = np.abs(offsets - offsets[order[middle]][cell])
+        weights = self._weights(apart, 1.5 * float(np.median(apart)), 1.5 * self._medians(apart))
+        total = np.maximum(np.bincount(cell, weights), 1e-9)
+        early, late, rest = (np.bincount(cell, weights * values) / total for values in (*self.times.T, offsets))
+        times, root = np.stack([early, late], -1), np.sqrt(total)
+        # 2. Project out what the path and the tones so far explain.
+        basis = _differences(*spline_taps(times + self.origin, self.start, self.step, self.count), self.count)
+        values = _basis(*self._envelope(times), self.envelope_knots)
+        tones = [_wave_columns(tone.waves(times, self.averaged), values) for tone in self.tones if tone.axis == axis]
+        known = np.concatenate([basis, *tones], 1) * root[:, None]
+        gram = known.T @ known
+        typical = max(float(np.median(gram.diagonal()[: self.count])), 1e-9)
+        gram[: self.count, : self.count] += _STIFFNESS * typical * _squared_differences(self.count, 3)
+        gram[np.diag_indices(len(gram))] += _LEAST * typical
+        factor = cho_factor(gram, lower=True)
+        rest = rest * root
+        rest = rest - known @ cho_solve(factor, known.T @ rest)
+        before = float(rest @ rest)
+        half = solve_triangular(factor[0], known.T, lower=True).astype(np.float32)
+        frequencies = grid.frequencies
+        # 3. What a tone of each frequency explains of the rest: the fit of a cosine and a sine. Waves are products of
+        # those of a coarse and a fine grid of frequencies, in a tenth of the time of sines and cosines.
+        fine = np.exp(2j * math.pi * grid.step * np.arange(_FINE)[:, None, None] * times.T)
+        fine, single_rest, parts = fine.astype(np.complex64), rest.astype(np.float32), []
+        of_rows = np.bincount(cell, weights * self.corners.rows) / total
+        swept = root * np.exp(1j * math.pi * (slope * times.T**2 + 2 * turns * of_rows))
+        for first in frequencies[::_FINE]:
+            both = fine * (swept * np.exp(2j * math.pi * first * times.T)).astype(np.complex64)
+            waves = both[:, 1] - both[:, 0]
+            wave = np.stack([waves.real, waves.imag])  # cosine and sine (2, F, cells)
+            hidden = wave @ half.T
+            cc, ss = np.square(wave).sum(-1) - np.square(hidden).sum(-1)
+            cs = (wave[0] * wave[1]).sum(-1) - (hidden[0] * hidden[1]).sum(-1)
+            parts.append(np.stack([cc, ss, cs, *(wave @ single_rest)]))
+        cc, ss, cs, c, s = np.concatenate(parts, -1)[:, : len(frequencies)]
+        determinant = cc * ss - cs**2
+        size = 0.5 * (cc + ss)  # of what remains of a wave; its phase must be determined as well
+        is_visible = wanted & (size > _MIN_SHARE * size[wanted].max(initial=0.0)) & (determinant > 1e-2 * size**2)
+        explained = (ss * c**2 - 2 * cs * c * s + cc * s**2) / np.where(is_visible, determinant, np.inf)
+        # 4. The highest peak; a maximum at the edge of a band of frequencies belongs to a tone outside of it.
+        inner = wanted[2:] & wanted[:-2] & (explained[1:-1] >= explained[:-2]) & (explained[1:-1] >= explained[2:])
+        explained[1:-1] *= inner
+        explained[[0, -1]] = 0.0
+        best = int(explained.argmax())
+        freedom = max(len(rest) - len(gram) - 3, 1)
+        ratio = 0.5 * explained[best] / max((before - explained[best]) / freedom, 1e-12)
+        return float(frequencies[best]), float(ratio), math.sqrt(explained[best] / float(total.sum()))
+
+
+def averaging(exposure: float, row_time: float, size: tuple[int, int]) -> Averaged:
+    """The times over which the displacement of a corner of frames (H, W) is a mean."""
+    return exposure, _PATCH_ROWS * reduction(*size) * row_time
+
+
+def distances_left(
+    corners: Corners, interval: float, averaged: Averaged, tones: Sequence[tuple[int, float]] = ()
+) -> Array:
+    """(N,) px, what a path and tones of given axes and frequencies (Hz) leave of the offsets of corners.
+
+    Other arguments are as in ``fit_window``.
+    """
+    fit = WindowFit(corners, interval, averaged)
+    fit.add_tones(tones)
+    fit.solve(ROUNDS)
+    return fit.distance
+
+
+def fit_window(
+    corners: Corners,
+    interval: float,
+    averaged: Averaged,
+    readout: float,
+    has_tones: bool = True,
+    slopes: Sequence[float] | Array = (0.0,),
+) -> WindowFit:
+    """Fit of path and tones to the ``corners`` of all pairs of a window of frames, an ``interval`` in s apart.
+
+    A corner is displaced by the mean of the displacement over the times ``averaged``; the ``readout`` takes from the
+    first to the last row (s). Without ``has_tones``, no tones are looked for; ``slopes`` in Hz/s are those of tones.
+    """
+    fit = WindowFit(corners, interval, averaged)
+    fit.solve(ROUNDS)
+    fit = fit.of_layer()
+    grid = fit.searched(readout)
+    axes = [0, 1] if has_tones and grid.is_visible.sum() > 2 else []
+    # Strongest tones by axis and slope. A tone of one axis does not change those of the other.
+    found: dict[tuple[int, float], tuple[float, float, float]] = {}
+    left_out = np.zeros((2, len(grid.frequencies)), bool)
+    while axes:
+        for axis, slope in ((axis, float(slope)) for axis in axes for slope in slopes):
+            if (axis, slope) not in found:
+                wanted = grid.is_resolved if abs(slope) > _FAST else grid.is_visible
+                wanted = wanted & fit.is_apart(axis, grid.frequencies) & ~left_out[axis]
+                found[axis, slope] = fit.strongest(axis, grid, wanted, slope=slope)
+        (axis, slope), (frequency, ratio, offsets) = max(found.items(), key=lambda item: item[1][1])
+        if ratio < MIN_RATIO or offsets < _MIN_EXPLAINED:
+            break
+        best, *_ = fit.with_aliases(axis, frequency, slope, grid.limits)
+        found = {of: value for of, value in found.items() if of[0] != axis}
+        best.solve()
+        if best.has_blind_tone():
+            # A part of the picture that moves by itself displaces the same rows again and again: without vibration, it
+            # became tones of up to 70 px at the frame rate.
+            blind = round(frequency * interval) / interval
+            left_out[axis] |= np.abs(grid.frequencies - blind) <= abs(frequency - blind) + grid.step
+            continue
+        fit = best
+        axes = [axis for axis in (0, 1) if sum(one.axis == axis for one in fit.tones) < _MOST_TONES]
+    # Tones that others explain in the end, that are none of all rows, or whose aliases explain them as well.
+    number = -1
+    for _ in range(4 * _MOST_TONES):
+        if len(fit.tones) == number:
+            break
+        number = len(fit.tones)
+        fit.solve()
+        fit.keep_tones()
+        changed = fit.with_distinct_tones(grid.limits)
+        if changed is not None:
+            fit, number = changed, -1
+    return fit
