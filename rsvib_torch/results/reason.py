@@ -321,9 +321,9 @@ _SHAPES = {
         "part of the frames of a video that are copies of the frame before, above 5 %",
     ),
     "rows_differ": ReasonKind(
-        "{value:.0%} of a tone is left in a third of the rows, {limit:.0%} is allowed: a part of the picture moves by "
-        "itself",
-        compares="largest part of a tone of a video that is left in a third of the rows, above 25 %",
+        "{value:.0%} of a tone is left in a third of the rows or columns, {limit:.0%} is allowed: a part of the "
+        "picture moves by itself, or roll or zoom vibrates",
+        compares="largest part of a tone of a video that is left in a third of the rows or columns, above 25 %",
     ),
     "corners_unexplained": _px(
         "corners move by {value:.3g} px that no path of the camera and no tones explain, {limit:.2g} px are allowed; "

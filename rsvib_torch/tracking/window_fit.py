@@ -38,9 +38,12 @@ _MIN_EXPLAINED = 0.03  # px rms, of the offsets that a tone explains; smaller on
 _LOWEST = 0.6  # of the frame rate; the path follows slower motion
 _HIGHEST = 2000.0  # Hz; rows that are read nearly at once would resolve any frequency, and the search would not end
 _MIN_GAIN = 0.15  # |2 sin(pi f T)|; tones close to a multiple of the frame rate hardly change from frame to frame
-# Tones of at most this gain of which more is left in a third of the rows are left out: 0.1 to 0.8 of 20 of 24 tones by
-# objects that move in some rows, below 0.03 of tones of cameras at such frequencies
+# Tones of at most this gain of which more is left in a third of the rows or columns are left out: 0.1 to 0.8 of 20 of
+# 24 tones by objects that move in some rows, below 0.03 of tones of cameras at such frequencies
 _NEARLY_BLIND, _MAX_APART = 0.5, 0.1
+# Other tones, likewise: 0.6 to 5 of roll and zoom, whose removal made a third of the frame wobble more; below 0.03 in
+# 40 clips, 0.23 in nearly dark ones
+_MOST_APART = 0.5
 SIGNIFICANT = 3.0  # standard deviations of a tone
 _MIN_SHARE = 2e-3  # of the largest variance that a tone of 1 px causes; others are hidden by the path
 _MIN_SINC = 0.1  # of the amplitude that remains in the mean over the exposure
@@ -89,7 +92,7 @@ class WindowTone:
     slope: float = 0.0  # Hz/s, by which the frequency changes
     amplitude_std: float = math.inf  # px
     frequency_std: float = math.inf  # Hz
-    apart: float = 0.0  # largest part of the tone that is left in a third of the rows
+    apart: float = 0.0  # largest part of the tone that is left in a third of the rows or columns
 
     def at(self, time: float, origin: float, weight: float = 1.0) -> Tone:
         """The tone as it is at a time in s, with the time origin of its phase, multiplied by a weight."""
@@ -425,7 +428,7 @@ class WindowFit:
         return any(_gain(tone.frequency, self.interval) < _MIN_GAIN for tone in self.tones if abs(tone.slope) <= _FAST)
 
     def keep_tones(self) -> None:
-        """Leave out insignificant tones, and those near blind frequencies that thirds of the rows contradict."""
+        """Leave out insignificant tones, and those that thirds of the rows or columns contradict."""
         waves, residual = [], self.corners.offsets - self.explained(self.knots)
         for tone in self.tones:
             index, factors = self._envelope(self.times)
@@ -433,12 +436,16 @@ class WindowFit:
             waves.append(wave[:, 1] - wave[:, 0])
             residual[:, tone.axis] -= waves[-1].real
         root = np.sqrt(self.weights)
-        thirds = (3 * self.corners.rows).astype(np.int64)
+        # thirds of the rows and of the columns: roll and zoom displace opposite sides in opposite directions
+        across = self.corners.places[:, 0]
+        sides = np.stack([self.corners.rows, (across - across.min()) / max(float(np.ptp(across)), 1.0)])
+        thirds = np.minimum(3 * sides, 2).astype(np.int64)
+        parts = [of_side == third for of_side in thirds for third in range(3)]
         for tone, wave in zip(self.tones, waves, strict=True):
             columns = root[:, None] * np.stack([wave.real, -wave.imag], -1)
             left = root * residual[:, tone.axis]
-            fits = (np.linalg.lstsq(columns[thirds == third], left[thirds == third]) for third in range(3))
-            tone.apart = max(float(np.hypot(*solution)) for solution, *_ in fits)
+            fits = [np.linalg.lstsq(columns[part], left[part])[0] for part in parts]
+            tone.apart = max(float(np.hypot(*solution)) for solution in fits)
 
         def is_kept(tone: WindowTone, wave: NDArray[np.complex128]) -> bool:
             least = _NEARLY_BLIND if tone.apart > _MAX_APART else _MIN_GAIN
@@ -446,6 +453,7 @@ class WindowFit:
             size = math.sqrt(np.square(np.abs(tone.knots)).mean())
             return bool(
                 is_visible
+                and tone.apart < _MOST_APART
                 and size > SIGNIFICANT * tone.amplitude_std
                 and 0.5 * np.square(np.abs(wave)).mean() > _MIN_EXPLAINED**2
             )

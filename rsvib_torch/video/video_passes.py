@@ -50,7 +50,7 @@ _GAIN_ERROR = 0.02  # of an amplitude: the mean over the patch of a corner is kn
 # path. 36 tones of 33 to 177 Hz and 0.4 to 2.5 px behind 4 ms: 0.07 to 0.34, amplitudes were up to 15 % too large
 _BLUR_BIAS = 0.15
 _SAME_ALIAS = 0.01  # periods per frame; tones are separated from 0.02 on in a window of 96 frames
-_MAX_APART = 0.25  # of a tone, left in a third of the rows: tones of cameras have up to 0.14, in clips at night
+_MAX_APART = 0.25  # of a tone, left in a third of the rows or columns: up to 0.14 of tones of cameras, at night
 # Of the usual change from frame to frame: at least 0.18 in 36 clips that a hand holds, and at most 0.12 of copies in a
 # video of 24 frames per second that is stored as 30. More frames in a row are no copies: a pan has ended, or it is dark
 _COPY, _MEMORY, _MOST_IN_A_ROW = 0.15, 8, 3
