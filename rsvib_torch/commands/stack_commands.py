@@ -283,8 +283,6 @@ class ReportOptions(shared.RestorationCommand, shared.VerdictOptions):
 
     out: Path = argument()
     """Folder for report.html and its figures."""
-    edge: list[str] | None = option(None, metavar="EDGE", show_default="edges are searched for")
-    """Slanted edge to measure: TOP,LEFT,HEIGHT,WIDTH in px; may be given several times."""
     manifest: Path | None = None
     """The manifest.json of rsvib run or detect with windows: draw amplitude and frequency over the windows. The page of
     a run that followed the vibration shows the frames of that run, and detects nothing anew."""
@@ -298,7 +296,6 @@ def report(given: ReportOptions) -> Answer:
     Detection, restoration and verdict are those of rsvib run. The page needs no network; figures are also PNG files.
     """
     settings, frames, out = given.settings, given.stack, given.out
-    list(map(_edge_box, given.edge or ()))  # errors before anything is computed
     windows = None if given.manifest is None else stacks.read_manifest(given.manifest)
     inputs = [*given.inputs, *([] if given.manifest is None else [given.manifest])]
     answers.check_folder(out, ["report.html"], given.overwrite, inputs)
@@ -377,16 +374,7 @@ def _write_page(given: ReportOptions, page: reports.Report, answer: Answer) -> A
     """Write a page, and add its files to the answer."""
     inputs = [*given.inputs, *([] if given.manifest is None else [given.manifest])]
     with whole_folder(given.out) as folder, working("writing the page"):
-        files = reports.write_report_page(folder, page, list(map(_edge_box, given.edge or ())) or None)
+        files = reports.write_report_page(folder, page)
         shared.check_new([given.out / name for name in files], overwrite=True, inputs=inputs)
     answer.files += [given.out / name for name in files]
     return answer
-
-
-def _edge_box(text: str) -> reports.Box:
-    """Position of a slanted edge (top, left, height, width) in px."""
-    numbers = [int(part) for part in text.split(",") if part.strip().isdecimal()]
-    if len(numbers) != 4 or text.count(",") != 3:
-        raise ValueError(f"--edge must be TOP,LEFT,HEIGHT,WIDTH in px, got {text!r}")
-    top, left, height, width = numbers
-    return top, left, height, width

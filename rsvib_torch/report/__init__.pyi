@@ -1,4 +1,3 @@
-from .html.page import Box as Box
 from .html.page import write_report_page as write_report_page
 from .html.words import Report as Report
 from .plots import comparison_figure as comparison_figure

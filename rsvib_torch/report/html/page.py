@@ -64,35 +64,23 @@ def _find_edges(image: Tensor) -> list[Box]:
     return [(edge.top + top, edge.left + left, edge.height, edge.width) for edge in chain(*chosen)]
 
 
-def measure_edges(before: Tensor, after: Tensor, boxes: Sequence[Box] | None = None) -> tuple[list[Edge], list[str]]:
-    """Measure slanted edges in an input frame (H, W) and in the restored frame, which may have several points per px.
+def measure_edges(before: Tensor, after: Tensor) -> list[Edge]:
+    """Measure the slanted edges of a restored frame, which may have several points per px, and of the input (H, W)."""
+    points = after.shape[-1] // before.shape[-1]
 
-    Without ``boxes``, edges are searched for in the restored frame. Returns the edges that were measured there, and a
-    sentence for each failed measurement.
-    """
-    rows, columns = before.shape
-    points = after.shape[-1] // columns
-    for top, left, height, width in boxes or ():
-        if min(top, left) < 0 or min(height, width) < 1 or top + height > rows or left + width > columns:
-            place = f"{top},{left},{height},{width} (top, left, height, width)"
-            raise ValueError(f"edge {place} must be inside the frame of {rows} x {columns} px")
-    edges, notes = [], []
-
-    def measured(frame: Tensor, box: Box, scale: int, where: str) -> MtfCurve | None:
+    def measured(frame: Tensor, box: Box, scale: int) -> MtfCurve | None:
         top, left, height, width = (scale * side for side in box)
         try:
             return slanted_edge_mtf(frame[top : top + height, left : left + width])
-        except ValueError as error:
-            notes.append(f"The edge at {_region(*box)} was not measured{where}: {error}.")
+        except ValueError:
             return None
 
-    for box in _find_edges(after[::points, ::points]) if boxes is None else boxes:
-        restored = measured(after, box, points, "")
+    edges = []
+    for box in _find_edges(after[::points, ::points]):
+        restored = measured(after, box, points)
         if restored is not None:
-            edges.append(Edge(box, measured(before, box, 1, " in the input"), restored, points))
-        elif boxes is None:  # nobody asked for this edge
-            notes.pop()
-    return edges, notes
+            edges.append(Edge(box, measured(before, box, 1), restored, points))
+    return edges
 
 
 def whole_frame(report: Report, index: int, frames: dict[str, Tensor]) -> Pictures:
@@ -166,11 +154,8 @@ def _figures_of(report: Report, result: DetectionResult, removed: Vibration) -> 
     return figures
 
 
-def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None = None) -> list[str]:
-    """Write ``report.html`` and its figures as PNG files into an existing folder; returns the names of the files.
-
-    ``edges`` are positions of slanted edges in the frame on the page; None searches for them.
-    """
+def write_report_page(folder: Path, report: Report) -> list[str]:
+    """Write ``report.html`` and its figures as PNG files into an existing folder; returns the names of the files."""
     result, timing, windows, restored = report.detection, report.timing, report.windows, report.was_restored
     points, finer = report.restored.shape[-1] // report.frames.shape[-1], report.restored
     report = replace(report, restored=finer[..., ::points, ::points])
@@ -183,7 +168,7 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
         frames["restored"], detail = report.restored[last], finer[last]
         compared = (frame.nan_to_num(0.0) for frame in (enlarged(frames["input"], points), detail))
         figures["details"] = drawing(plots.comparison_figure(*compared, size=96 * points))
-    measured, notes = measure_edges(_grey(frames["input"]), _grey(detail), edges)
+    measured = measure_edges(_grey(frames["input"]), _grey(detail))
     for direction in sorted({edge.direction for edge in measured}):
         chosen = [edge for edge in measured if edge.direction == direction]
         curves = [[one.before for one in chosen if one.before is not None], [one.after for one in chosen]]
@@ -231,7 +216,6 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
         "window_tones": None if windows is None else windows.tone_table(),
         "mtf_head": ["edge", "direction", "angle", *(f"MTF50 of the {name} frame (cycles/px)" for name in frames)],
         "mtf_rows": [edge.row(restored) for edge in measured],
-        "mtf_notes": notes,
         "camera": words.camera_rows(timing, shape),
         "about": words.about_rows(report),
         "terms": words.TERMS,
