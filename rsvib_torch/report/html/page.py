@@ -218,7 +218,6 @@ def write_report_page(folder: Path, report: Report) -> list[str]:
         "mtf_rows": [edge.row(restored) for edge in measured],
         "camera": words.camera_rows(timing, shape),
         "about": words.about_rows(report),
-        "terms": words.TERMS,
     }
     write_page(folder / "report.html", content)
     for name, figure in figures.items():

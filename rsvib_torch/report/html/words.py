@@ -21,37 +21,6 @@ from rsvib_torch.text import measured_text
 
 Mark = Literal["good", "doubt", "bad"]
 _QUANTITIES = ("amplitude", "frequency", "period", "phase")
-# Terms that the page explains, in the order of its list
-TERMS = {
-    "displacement": "Distance in px by which the vibration moves the content of a row in the image; positive towards "
-    "larger x and y.",
-    "offset": "Displacement of a row in a frame minus its displacement in the frame before. Offsets are measured by "
-    "comparing the two frames; displacements follow from them.",
-    "residual": "Measured offset minus the offset that the detected vibration predicts.",
-    "amplitude": "Largest displacement of a sinusoid in px; the image moves by this amount to either side.",
-    "frequency": "Periods of the vibration per second.",
-    "period": "Duration of one oscillation, 1 / frequency.",
-    "phase": "Angle of the sinusoid at the exposure start of the first row of frame 0.",
-    "offset gain": "Offset between two consecutive frames in px per px of displacement, 2 sin(π f T) for the frequency "
-    "f and the frame period T. Errors of the offsets are divided by it, so that a tone with an offset gain near zero "
-    "cannot be measured. A negative sign reverses the offsets.",
-    "improvement": "PSNR of the restored frames minus PSNR of the input frames in dB, estimated without the true "
-    "scene. An increase of 6 dB is half the error.",
-    "PSNR": "Peak signal-to-noise ratio in dB: full scale over the root-mean-square error of a frame.",
-    "blind frequencies": "Frequencies that these frames cannot contain: multiples of the frame rate, at which all "
-    "frames are displaced alike, and multiples of 1 / exposure time, which the exposure averages to zero.",
-    "verdict": "Reliable: the vibration of this axis is significant, explains the measured offsets, and is accurate "
-    "enough to be removed. Otherwise the axis is left unchanged.",
-    "row time": "Time between the exposure starts of adjacent rows.",
-    "exposure time": "Duration of the exposure of one row; motion during it blurs the row.",
-    "frame period": "Time between the exposure starts of the same row in consecutive frames, blanking rows included.",
-    "scan axis": "Image axis along which the rows are read one after another, and the direction.",
-    "point spread function": "Image of a point of the scene: the path of the displacement during the exposure of a "
-    "row.",
-    "MTF50": "Spatial frequency at which the contrast (modulation transfer function, MTF) is one half; larger is "
-    "sharper. The Nyquist frequency is 0.5 cycles/px.",
-}
-
 
 WINDOWS_RESTORED = (
     "Windows of the stack were restored before, see below; all frames together have no steady vibration that can be "
