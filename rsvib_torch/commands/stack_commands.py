@@ -327,14 +327,11 @@ def report(given: ReportOptions) -> Answer:
     page = reports.Report(
         **_page_head(given, windows),
         frames=pixels if pattern is None else preparation.colour_frames(pixels, pattern),
-        restored=result.frames,
-        was_restored=result.restored,
+        restored=result.frames if result.restored else None,
         timing=timing,
         detection=detection,
         verdict=result.verdict,
-        left_alone=result.left_alone,
-        options=options,
-        next_steps=tuple(steps),
+        next_steps=steps,
     )
     return _write_page(given, page, answer)
 
@@ -352,7 +349,6 @@ def _report_of_run(given: ReportOptions, windows: stacks.StackManifest, made: Pa
         **_page_head(given, windows),
         frames=before if windows.margins is None else video.Margins(**windows.margins).cut(before),
         restored=after,
-        was_restored=True,
         timing=given.settings.timing,
         first=first,
     )
@@ -364,8 +360,7 @@ def _page_head(given: ReportOptions, windows: stacks.StackManifest | None) -> Ta
     return {
         "title": printable(f"Vibration in {given.stack.name}"),
         "subtitle": printable(f"{given.stack}, camera of {given.settings.source}"),
-        "version": rsvib_torch.__version__,
-        "command": current_output().command,
+        "made_with": f"rsvib_torch {rsvib_torch.__version__}: {current_output().command}",
         "windows": windows,
     }
 
@@ -373,6 +368,10 @@ def _page_head(given: ReportOptions, windows: stacks.StackManifest | None) -> Ta
 def _write_page(given: ReportOptions, page: reports.Report, answer: Answer) -> Answer:
     """Write a page, and add its files to the answer."""
     inputs = [*given.inputs, *([] if given.manifest is None else [given.manifest])]
+    texts = {title: "\n".join(lines) for title, lines in answer.results.items()}
+    if page.windows is not None and page.detection is not None:
+        texts["Windows of the stack"] = page.windows.summary()
+    page = replace(page, texts=texts)
     with whole_folder(given.out) as folder, working("writing the page"):
         files = reports.write_report_page(folder, page)
         shared.check_new([given.out / name for name in files], overwrite=True, inputs=inputs)

@@ -1,5 +1,5 @@
-from .html.page import write_report_page as write_report_page
-from .html.words import Report as Report
+from .page import Report as Report
+from .page import write_report_page as write_report_page
 from .plots import comparison_figure as comparison_figure
 from .plots import gain_figure as gain_figure
 from .plots import motion_figure as motion_figure
