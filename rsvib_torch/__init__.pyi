@@ -63,13 +63,11 @@ from .motion.vibration import blind_frequencies as blind_frequencies
 from .registration import OffsetCurve as OffsetCurve
 from .registration import register_bands as register_bands
 from .report import comparison_figure as comparison_figure
-from .report import gain_figure as gain_figure
 from .report import motion_figure as motion_figure
 from .report import mtf_figure as mtf_figure
 from .report import offset_figure as offset_figure
 from .report import psf_figure as psf_figure
 from .report import read_vibration as read_vibration
-from .report import rows_figure as rows_figure
 from .report import save_figure as save_figure
 from .report import windows_figure as windows_figure
 from .report import write_offsets as write_offsets

@@ -1,12 +1,10 @@
 from .page import Report as Report
 from .page import write_report_page as write_report_page
 from .plots import comparison_figure as comparison_figure
-from .plots import gain_figure as gain_figure
 from .plots import motion_figure as motion_figure
 from .plots import mtf_figure as mtf_figure
 from .plots import offset_figure as offset_figure
 from .plots import psf_figure as psf_figure
-from .plots import rows_figure as rows_figure
 from .plots import save_figure as save_figure
 from .plots import windows_figure as windows_figure
 from .results import check_same_timing as check_same_timing

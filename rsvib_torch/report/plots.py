@@ -31,7 +31,7 @@ from rsvib_torch.motion.detected_vibration import DetectedVibration, FollowedVib
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.motion.vibration import Vibration, blind_frequencies
+from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.numerics.tables import Array, true_runs
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.restoration import RestorationMtf, RestorationVerdict
@@ -378,77 +378,6 @@ def _verdict_figure(verdict: RestorationVerdict) -> Figure:
     panels[0].legend(**_LEGEND)
     panels[2].plot(verdict.predicted_gain, "o-", color=_X_COLOUR, markersize=4)
     panels[2].axhline(0.0, color=_GREY, linewidth=0.8)
-    return figure
-
-
-@checks_arguments
-def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
-    """Draw the offset gain of a pair of frames over frequency, and the detected tones with two standard deviations.
-
-    The offset gain is ``|2 sin(pi f m T_row) sinc(f T_e)|``, px of offset per px of displacement (Eqs. 2 and 7 of Liu
-    et al. 2023). Blind frequencies are dashed lines.
-
-    Example:
-        >>> import rsvib_torch as rsv
-        >>> frames, timing, _ = rsv.datasets.example_frames()
-        >>> gain_figure(rsv.detect_vibration(frames, timing, method="bands"), timing).axes[-1].get_xlabel()
-        'frequency (Hz)'
-    """
-    check_single("result", result.batch_shape)
-    vibration, std = result.vibration, result.std
-    highest = max(1.35 * float((vibration.frequency * (vibration.amplitude > 0)).max()), 4.2 / timing.frame_period)
-    frequency = np.linspace(0.0, highest, 2000)
-    gain = np.abs(2 * np.sin(np.pi * frequency * timing.frame_period) * np.sinc(frequency * timing.exposure_time))
-    figure, ((upper,), (lower,)) = _panels(5.6, 4.6, 2, sharex=True, height_ratios=(1.2, 1))
-    upper.plot(frequency, gain, color="#555555", linewidth=1.2)
-    for panel in (upper, lower):
-        for blind in blind_frequencies(timing, highest).tolist():
-            panel.axvline(blind, color=_GREY, linewidth=0.8, linestyle="--", zorder=0)
-    labels: Table = {}
-    for axis, tone in vibration.amplitude[:2].nonzero().tolist():
-        name, reliable = "xy"[axis], bool(result.reliable[axis])
-        style = _marker(_AXIS_COLOURS[name], reliable) | {"markersize": 6}
-        at, amplitude = float(vibration.frequency[axis, tone]), float(vibration.amplitude[axis, tone])
-        tone_gain = abs(float(result.gain[axis, tone])) * abs(float(np.sinc(at * timing.exposure_time)))
-        labels[name if reliable else f"{name} (not reliable)"] = upper.plot(at, tone_gain, **style)[0]
-        bars = [_error_bar(values[axis, tone]) for values in (std.amplitude, std.frequency)]
-        lower.errorbar(at, amplitude, *bars, capsize=3, elinewidth=1.4, **style)
-    if labels:
-        upper.legend(list(labels.values()), list(labels), **_LEGEND, loc="upper right", ncols=2)
-    upper.set(xlim=(0, highest), ylim=(0, 2.4))
-    lower.set_ylim(0, 1.15 * lower.get_ylim()[1])
-    plain_axes(upper, y="offset gain (px per px)")
-    plain_axes(lower, "frequency (Hz)", "amplitude (px)")
-    return figure
-
-
-def motion_blur(vibration: Motion, starts: Tensor, timing: SensorTiming) -> Tensor:
-    """Range of the displacement during the exposure of rows, (..., 2) in px, that start at (...) seconds."""
-    nodes, _ = exposure_nodes(timing, "gauss", 16)
-    ends = torch.tensor([0.0, timing.exposure_time], dtype=torch.float64, device="cpu")
-    path = vibration.displacement(starts[..., None] + torch.cat([ends, nodes.cpu()]).to(starts.device))
-    return path.amax(-2) - path.amin(-2)
-
-
-@checks_arguments
-def rows_figure(vibration: Motion, timing: SensorTiming, num_rows: Count) -> Figure:
-    """Draw mean displacement and motion blur of every row of frame 0.
-
-    Example:
-        >>> timing = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
-        >>> figure = rows_figure(Vibration([3.1, 5.2], [50.0, 30.0]), timing, num_rows=512)
-        >>> [panel.get_ylabel() for panel in figure.axes]
-        ['displacement (px)', 'motion blur (px)']
-    """
-    check_single("vibration", vibration.batch_shape)
-    vibration = vibration.detached()
-    starts = timing.row_starts(1, num_rows)[0]
-    figure, ((upper,), (lower,)) = _panels(5.6, 4.6, 2, sharex=True)
-    _plot_axes(upper, np.arange(num_rows), vibration.mean_displacement(starts, timing.exposure_time))
-    _plot_axes(lower, np.arange(num_rows), motion_blur(vibration, starts, timing), legend=False)
-    plain_axes(upper, "", "displacement (px)")
-    plain_axes(lower, "row (in readout order)", "motion blur (px)")
-    lower.set_ylim(bottom=0)
     return figure
 
 

@@ -208,7 +208,7 @@ def test_batches_are_drawn_over_windows_or_stacks(frames, windows):
 
 
 def test_figures_of_batches_are_refused(windows):
-    for draw in (rsv.offset_figure, lambda w: rsv.gain_figure(w, TIMING), lambda w: rsv.motion_figure(w.vibration)):
+    for draw in (rsv.offset_figure, lambda w: rsv.motion_figure(w.vibration)):
         with pytest.raises(ValueError, match=r"is a batch of shape \(3,\): pass one of them"):
             draw(windows)
 
