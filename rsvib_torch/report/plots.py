@@ -24,6 +24,7 @@ from rsvib_torch.checks.values import check_single
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.detection.spectrum import SMALLEST_SHOWN
 from rsvib_torch.evaluation import MtfCurve
+from rsvib_torch.files.atomic import whole_file
 from rsvib_torch.files.reading import Table
 from rsvib_torch.imaging import row_psf
 from rsvib_torch.imaging.trajectory import exposure_nodes
@@ -36,7 +37,7 @@ from rsvib_torch.numerics.tables import Array, true_runs
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.restoration import RestorationMtf, RestorationVerdict
 from rsvib_torch.results.presentation import AXIS_NAMES, AXIS_UNITS, FIGURES
-from rsvib_torch.results.result_files import figure_png, write_figure
+from rsvib_torch.results.result_files import figure_png
 from rsvib_torch.row_time import RowTimeCalibration
 from rsvib_torch.stacks import StackManifest
 from rsvib_torch.text import measured_text
@@ -63,16 +64,6 @@ class _Drawing(Figure):
         return figure_png(self, dpi=90)
 
 
-def tones_text(result: DetectionResult, axis: int) -> list[str]:
-    """Amplitude and frequency of every tone of an axis, one text each."""
-    vibration, std = result.vibration, result.std
-    return [
-        f"{measured_text(vibration.amplitude[axis, tone], std.amplitude[axis, tone])} {AXIS_UNITS[axis]} at "
-        f"{measured_text(vibration.frequency[axis, tone], std.frequency[axis, tone])} Hz"
-        for tone in vibration.amplitude[axis].nonzero()[:, 0].tolist()
-    ]
-
-
 @checks_arguments
 def save_figure(
     figure: Figure, path: str | os.PathLike[str], *, dpi: Annotated[int, Field(ge=1, le=10_000)] = 150
@@ -84,7 +75,8 @@ def save_figure(
         path: The file to write; its ending selects the format (``.png``, ``.svg``, ``.pdf``).
         dpi: Pixels per inch.
     """
-    write_figure(figure, path, dpi)
+    with whole_file(path) as part:
+        figure.savefig(part, dpi=dpi, facecolor="white")
 
 
 def plain_axes(panel: Axes, x: str = "", y: str = "", *, title: str = "", heading: str = "") -> None:
@@ -201,24 +193,6 @@ def _draw_offsets(upper: Axes, lower: Axes, result: DetectionResult, axis: int) 
     return points
 
 
-def offset_panels(result: DetectionResult, axes: Sequence[int], width: float, height: float) -> tuple[Figure, Panels]:
-    """Figure of the offsets of some axes with their fit and residuals, and its panels (2, axes)."""
-    check_single("result", result.batch_shape)
-    sharex = len(result.offsets.pairs) <= _MOST_PAIRS or "row"  # all pairs are shown, or only below
-    figure, panels = _panels(width, height, 2, len(axes), sharex=sharex, height_ratios=(3, 1))
-    points = [_draw_offsets(panels[0, column], panels[1, column], result, axis) for column, axis in enumerate(axes)]
-    _legend_below(
-        figure,
-        _symbol("measured rows", color=_QUALITY_COLOURS(1.0), markersize=5),
-        _symbol("detected vibration", color=_FIT_COLOUR, marker="", linewidth=1.3),
-        _symbol("not measured", color=_GREY, marker="x", markersize=5),
-    )
-    bar = figure.colorbar(points[-1], ax=panels, fraction=0.025, pad=0.01)
-    bar.set_label("quality (0: outlier)", color=_INK)
-    bar.outline.set_visible(False)
-    return figure, panels
-
-
 @checks_arguments
 def offset_figure(result: DetectionResult) -> Figure:
     """Draw the offset curve of each axis with its fit, and the residuals (as Figure 6 of Liu et al. 2023).
@@ -234,16 +208,32 @@ def offset_figure(result: DetectionResult) -> Figure:
         >>> [panel.get_ylabel() for panel in offset_figure(rsv.detect_vibration(frames, timing, method="bands")).axes]
         ['offset (px)', 'offset (px)', 'residual (px)', 'residual (px)', 'quality (0: outlier)']
     """
-    axes = result.vibration.num_axes
-    figure, panels = offset_panels(result, range(axes), 6.5 * axes, 6.4)
-    for axis, (name, upper) in enumerate(zip(AXIS_NAMES, panels[0], strict=False)):
+    check_single("result", result.batch_shape)
+    vibration, std, axes = result.vibration, result.std, result.vibration.num_axes
+    sharex = len(result.offsets.pairs) <= _MOST_PAIRS or "row"  # all pairs are shown, or only below
+    figure, panels = _panels(6.5 * axes, 6.4, 2, axes, sharex=sharex, height_ratios=(3, 1))
+    for axis, (name, upper, lower) in enumerate(zip(AXIS_NAMES, *panels, strict=False)):
+        points = _draw_offsets(upper, lower, result, axis)
         upper.set_title(f"Offset along {name}" if axis < 2 else f"Offset of {name}", **_HEADING, pad=36)
-        text = ",  ".join(tones_text(result, axis))
+        text = ",  ".join(
+            f"{measured_text(vibration.amplitude[axis, tone], std.amplitude[axis, tone])} {AXIS_UNITS[axis]} at "
+            f"{measured_text(vibration.frequency[axis, tone], std.frequency[axis, tone])} Hz"
+            for tone in vibration.amplitude[axis].nonzero()[:, 0].tolist()
+        )
         if not bool(result.reliable[axis]):
             text = "not reliable: " + "; ".join(str(reason) for reason in result.reasons[axis])
         text = "\n".join(textwrap.wrap(text, 76, max_lines=2, placeholder=" …"))
         note = upper.annotate(text, (0, 1), (0, 32), "axes fraction", "offset points", va="top", fontsize=9.5)
         note.set_in_layout(False)  # a long text would reduce the size of the panels
+    _legend_below(
+        figure,
+        _symbol("measured rows", color=_QUALITY_COLOURS(1.0), markersize=5),
+        _symbol("detected vibration", color=_FIT_COLOUR, marker="", linewidth=1.3),
+        _symbol("not measured", color=_GREY, marker="x", markersize=5),
+    )
+    bar = figure.colorbar(points, ax=panels, fraction=0.025, pad=0.01)
+    bar.set_label("quality (0: outlier)", color=_INK)
+    bar.outline.set_visible(False)
     return figure
 
 

@@ -26,7 +26,7 @@ from rsvib_torch.files.reading import Table
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.results.higher_packages import IMPORTERS
 from rsvib_torch.results.reason import Findings, texts
-from rsvib_torch.results.result_files import figure_png, result_of, write_figure
+from rsvib_torch.results.result_files import figure_png, result_of
 from rsvib_torch.text import AXES, data_uri, text_table, wrapped
 
 if TYPE_CHECKING:
@@ -335,7 +335,7 @@ class Result(Summarised):
             raise TypeError(f"{type(self).__name__} has no figure; these have one: {', '.join(drawn)}")
         figure = draw(self.mapped(lambda values: values.detach().cpu()))
         if path is not None:
-            write_figure(figure, path)
+            IMPORTERS["figures"]().save_figure(figure, path)
         return figure
 
     def _figure_function(self) -> "Callable[..., Figure] | None":
