@@ -72,7 +72,6 @@ from .report import save_figure as save_figure
 from .report import windows_figure as windows_figure
 from .report import write_offsets as write_offsets
 from .report import write_table as write_table
-from .report import write_vibration as write_vibration
 from .restoration import FixedDewarp as FixedDewarp
 from .restoration import RestorationMtf as RestorationMtf
 from .restoration import RestorationVerdict as RestorationVerdict

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -189,7 +190,7 @@ def write_detection(
 ) -> list[str]:
     """Write a detection as JSON, tables and figures, and return the names of the files."""
     with working("drawing the offset curve"):
-        reports.write_vibration(folder / "vibration.json", result, timing)
+        replace(result, timing=timing).save(folder / "vibration.json")
         reports.write_table(folder / "tones.csv", result, pixel_size=pixel_size)
         reports.write_offsets(folder / "offsets.csv", result)
         drawn = draw_safely(folder / "offsets.png", lambda: reports.offset_figure(result))

@@ -8,7 +8,6 @@ from .plots import psf_figure as psf_figure
 from .plots import save_figure as save_figure
 from .plots import windows_figure as windows_figure
 from .results import check_same_timing as check_same_timing
-from .results import load_detection as load_detection
 from .results import motion_columns as motion_columns
 from .results import read_vibration as read_vibration
 from .results import restoration_data as restoration_data
@@ -16,4 +15,3 @@ from .results import write_columns as write_columns
 from .results import write_offsets as write_offsets
 from .results import write_restoration as write_restoration
 from .results import write_table as write_table
-from .results import write_vibration as write_vibration

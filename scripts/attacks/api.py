@@ -98,7 +98,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     pairs = torch.zeros(2, 3, dtype=torch.float64)
     values = (0.0, 1e-4, 1.0, 1e-4, unit, unit, 500.0, 1.0, 1e-4, 1e-6, pairs, unit, 0.01, unit[:2])
     rotation = rsv.RotationAlignment(recorded, "YxZ", *values, pairs, pairs, True, ())
-    rsv.write_vibration(folder / "vibration.json", detected)
+    detected.save(folder / "vibration.json")
     options: dict[str, Any] = {"detection": DETECTION, "restoration": {"method": "dewarp"}}
     options |= {"full_scale": None, "force": False, "device": "cpu"}
     windows = {"window": 3, "memory": "1GB", "workers": 1, **options}
@@ -182,7 +182,6 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
         "write_gcsv": {"path": new["rates.gcsv"], "motion": with_camera, "num_frames": 2},
         "write_offsets": {"path": folder / "offsets.csv"},
         "write_stack": {"path": folder / "written.tif", "like": info},
-        "write_vibration": {"path": folder / "written.json"},
         "write_table": {"path": folder / "tones.csv"},
     }
     functions = {name: getattr(rsv, name) for name in rsv.__all__ if inspect.isfunction(getattr(rsv, name))}
