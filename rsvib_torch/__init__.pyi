@@ -24,8 +24,6 @@ from .detection import detect_motion as detect_motion
 from .detection import detect_swept_tone as detect_swept_tone
 from .detection import detect_vibration as detect_vibration
 from .evaluation import MtfCurve as MtfCurve
-from .evaluation import SlantedEdge as SlantedEdge
-from .evaluation import find_slanted_edges as find_slanted_edges
 from .evaluation import psnr as psnr
 from .evaluation import slanted_edge_mtf as slanted_edge_mtf
 from .evaluation import ssim as ssim

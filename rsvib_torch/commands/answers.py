@@ -150,7 +150,7 @@ def steps_after_detection(
 
 def page_step(frames: Path, out: Path, settings: Config, *more: str | Path) -> str:
     """The step to write a page about a restored stack."""
-    sentence = "write a page with all figures and the sharpness before and after"
+    sentence = "write a page with all figures"
     return next_step(sentence, "report", frames, out, *settings.arguments, *more)
 
 

@@ -1,7 +1,6 @@
 """The page of ``rsvib report``: verdict, frames before and after, figures, and what the program prints, in one file."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -14,7 +13,6 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from rsvib_torch.detection import DetectionResult
-from rsvib_torch.evaluation import MtfCurve, find_slanted_edges, slanted_edge_mtf
 from rsvib_torch.files.atomic import whole_file
 from rsvib_torch.files.reading import Table
 from rsvib_torch.frames.pixels import enlarged
@@ -32,9 +30,7 @@ _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMW
 _LARGEST = 4096  # px; longer sides of a frame are reduced
 _PERCENTILES = (0.2, 99.8)  # drawn black and white; few saturated or dead pixels do not reduce the contrast
 _PART = 480  # px; side of the part of two consecutive frames that is shown in turn
-_SEARCHED = 2048  # px; slanted edges are searched for in the middle of the frame: 4 s
 _RIM = 16  # px at the border of restored frames, which the extension of the frames changes
-_EDGES = 3  # of each direction, the strongest ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,43 +171,13 @@ def frames_in_turn(report: Report, index: int, image_motion: Tensor) -> Table | 
 # --- Figures ---
 
 
-def sharpness_figures(frames: Mapping[str, Tensor], points: int) -> Iterator[tuple[str, str, Figure]]:
-    """MTF of slanted edges along each direction, as ``figures_of``; the last of the frames is searched for edges.
-
-    Frames are grey, (H, W); the last one has this number of points per px along each axis.
-    """
-    scales = dict.fromkeys(frames, 1) | {list(frames)[-1]: points}
-    searched = list(frames.values())[-1][::points, ::points]
-    top, left = (max(_RIM, (size - _SEARCHED) // 2) for size in searched.shape)
-    edges = find_slanted_edges(searched[top:-top, left:-left])
-    for direction, vertical in (("horizontal", True), ("vertical", False)):
-        curves: dict[str, list[MtfCurve]] = {name: [] for name in frames}
-        for edge in [edge for edge in edges if edge.near_vertical == vertical][:_EDGES]:
-            for name, scale in scales.items():
-                y, x, height, width = (scale * n for n in (edge.top + top, edge.left + left, edge.height, edge.width))
-                with suppress(ValueError):  # a vibration can tear an edge of the input apart
-                    curves[name].append(slanted_edge_mtf(frames[name][y : y + height, x : x + width]))
-        if any(curves.values()):
-            means = [
-                f"{name} {scales[name] * float(torch.stack([edge.mtf50 for edge in measured]).nanmean()):.3f}"
-                for name, measured in curves.items()
-                if measured
-            ]
-            caption = (
-                f"{direction.capitalize()} sharpness: MTF of slanted edges, thin, and their mean; MTF50 in cycles/px: "
-            )
-            caption += f"{', '.join(means)}. The displacement of rows does not count as blur."
-            yield f"mtf_{direction}", caption, plots.mtf_figure(curves, points=scales)
-
-
 def figures_of(report: Report, index: int, removed: Vibration | None) -> Iterator[tuple[str, str, Figure]]:
     """Name of the file, caption, and figure of everything that the page shows of frame ``index``."""
     result, finer = report.detection, report.restored
-    frames, points = {"input": report.frames[index]}, 1
     if finer is not None:
         points = finer.shape[-1] // report.frames.shape[-1]
-        frames["restored"] = finer[min(index, len(finer) - 1)]
-        compared = (enlarged(frames["input"], points).nan_to_num(0.0), frames["restored"].nan_to_num(0.0))
+        pair = enlarged(report.frames[index], points), finer[min(index, len(finer) - 1)]
+        compared = [frame.nan_to_num(0.0) for frame in pair]
         grid = f", which have {points} x {points} points per px" * (points > 1)
         caption = f"Parts of both frames with the strongest detail{grid}; each pair has a grey scale of its own."
         yield "details", caption, plots.comparison_figure(*compared, size=96 * points)
@@ -227,7 +193,6 @@ def figures_of(report: Report, index: int, removed: Vibration | None) -> Iterato
     if report.windows is not None and report.windows.gyroscope is None:  # no tones are searched for otherwise
         caption = "Amplitude and frequency over the windows, with two standard deviations."
         yield "windows", caption, report.windows.plot()
-    yield from sharpness_figures({name: plots.picture(frame).mean(-1) for name, frame in frames.items()}, points)
 
 
 # --- Page ---

@@ -409,30 +409,23 @@ def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: Count) -> Figu
 
 
 @checks_arguments
-def mtf_figure(curves: Mapping[str, Sequence[MtfCurve]], *, points: Mapping[str, int] | None = None) -> Figure:
+def mtf_figure(curves: Mapping[str, Sequence[MtfCurve]]) -> Figure:
     """Draw modulation transfer functions of slanted edges: thin lines for the edges, a bold line for their mean.
 
     Args:
         curves: Measured edges of the input and of the restored frame, or of one image, by the name in the legend.
-        points: Points per px of those images that are on a finer grid, by name. Frequencies are in cycles per px, up to
-            the Nyquist frequency of the finest grid, in which that of the pixels is marked.
 
     Example:
         >>> figure = mtf_figure({"raw": [raw_curve], "restored": [restored_curve]})  # doctest: +SKIP
     """
     figure, ((panel,),) = _panels(5.6, 3.9)
-    points = points or {}
-    highest = 0.5 * max([1, *points.values()])
-    frequency = torch.linspace(0, highest, 101, dtype=torch.float64, device="cpu")
+    frequency = torch.linspace(0, 0.5, 101, dtype=torch.float64, device="cpu")
     for colour, (name, edges) in zip((_GREY, _X_COLOUR)[-len(curves) :], curves.items(), strict=True):
-        values = [edge.at(frequency.to(edge.lsf.device) / points.get(name, 1)).cpu() for edge in edges]
+        values = [edge.at(frequency.to(edge.lsf.device)).cpu() for edge in edges]
         for value in values:
             panel.plot(frequency, value, color=colour, linewidth=0.7, alpha=0.5)
-        if values:
-            panel.plot(frequency, torch.stack(values).mean(0), color=colour, linewidth=2.0, label=name)
-    _finish_mtf(panel, highest, "MTF")
-    if highest > 0.5:
-        panel.text(0.51, 1.0, "Nyquist frequency of the pixels", fontsize=8, color=_GREY)
+        panel.plot(frequency, torch.stack(values).mean(0), color=colour, linewidth=2.0, label=name)
+    _finish_mtf(panel, 0.5, "MTF")
     return figure
 
 

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks.arrays import as_tensor
-
 
 def edge_spread(distance: Tensor, sigma: Tensor, slope: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Edge and line spread function of Gaussian optics and square pixels, and the derivative of the first by sigma.
@@ -195,16 +193,10 @@ def fit_edge(scatter: Scatter) -> EdgeFit:
 # --- Checks ---
 
 
-def as_real(name: str, value: object) -> Tensor:
-    """Return a tensor or array of real numbers as a tensor."""
-    values = as_tensor(name, value)
-    if values.dtype == torch.bool or values.dtype.is_complex:
-        raise TypeError(f"{name} must hold real numbers, got {values.dtype}")
-    return values
-
-
 def check_roi(roi: Tensor) -> Tensor:
     """The ROI in float64 after checks of its shape and values."""
+    if roi.dtype == torch.bool or roi.dtype.is_complex:
+        raise TypeError(f"roi must hold real numbers, got {roi.dtype}")
     if roi.ndim != 2:
         raise ValueError(f"roi must be one grey image (h, w), got shape {tuple(roi.shape)}")
     if min(roi.shape) < 16:
@@ -218,7 +210,7 @@ def check_roi(roi: Tensor) -> Tensor:
     return values
 
 
-def check_edge(fit: EdgeFit, scatter: Scatter, limits: tuple[float, float] = (-math.inf, math.inf)) -> float:
+def check_edge(fit: EdgeFit, scatter: Scatter, limits: tuple[float, float]) -> float:
     """Raise if the ROI does not contain one measurable slanted edge, of values within ``limits``.
 
     The result is the smallest distance in px between the edge and a border of the turned ROI beside it.
