@@ -134,13 +134,12 @@ def frames_in_turn(report: Report, index: int, image_motion: Tensor) -> Table | 
     displacement by the vibration remains.
     """
     count = len(report.frames)
-    first = min(index, count - 2)
-    starts = report.timing.frame_starts(count)
+    if count < 2:
+        return None
+    first, starts = min(index, count - 2), report.timing.frame_starts(count)
+    right, down = (image_motion[:2] * float(starts[first + 1] - starts[first])).round().int().tolist()
     height, width = report.frames.shape[-2:]
-    right, down = 0, 0
-    if count > 1:
-        right, down = (image_motion[:2] * float(starts[first + 1] - starts[first])).round().int().tolist()
-    if count < 2 or min(height - abs(down), width - abs(right)) < 32:  # px; too little in common
+    if min(height - abs(down), width - abs(right)) < 32:  # px; the frames have too little in common
         return None
     # the part of the first frame that both contain, and what the second one shows of it
     inner = (..., slice(max(0, -down), height - max(0, down)), slice(max(0, -right), width - max(0, right)))
@@ -161,9 +160,8 @@ def frames_in_turn(report: Report, index: int, image_motion: Tensor) -> Table | 
     if right or down:
         shift = f"{-right} px along x and {-down} px along y"
         caption += f" Frame {report.first + first + 1} is moved by {shift}, the uniform motion."
-    caption += (
-        " The motion between the input frames is the vibration; restored frames do not move where it was removed."
-    )
+    caption += " The motion between the input frames is the vibration"
+    caption += "; restored frames do not move where it was removed." if len(stacks) > 1 else "."
     panels = [(name, uris[2 * number : 2 * number + 2]) for number, name in enumerate(stacks)]
     return {"panels": panels, "label": f"Show frame {report.first + first + 1}", "caption": caption}
 
@@ -182,9 +180,7 @@ def figures_of(report: Report, index: int, removed: Vibration | None) -> Iterato
         caption = f"Parts of both frames with the strongest detail{grid}; each pair has a grey scale of its own."
         yield "details", caption, plots.comparison_figure(*compared, size=96 * points)
     if result is not None:
-        caption = (
-            "Measured offsets of the rows between frames, the offsets by the detected vibration, and the residual."
-        )
+        caption = "Measured offsets of the rows between frames, offsets by the detected vibration, and the residual."
         yield "offsets", caption, plots.offset_figure(result)
     if removed is not None and bool(removed.moving_axes().any()):
         num_rows = report.frames.shape[int(report.timing.scan_axis)]
@@ -215,13 +211,13 @@ def write_report_page(folder: Path, report: Report) -> list[str]:
     result, timing, finer, count = report.detection, report.timing, report.restored, len(report.frames)
     # the motion that was removed, at the centre of the frame
     removed, image_motion = None, torch.zeros(2)
-    followed = None if report.windows is None else report.windows.followed()
     if result is not None:
         num_rows = report.frames.shape[int(timing.scan_axis)]
         removed = trusted_vibration(result, timing, count, num_rows)[0].to("cpu").translation()
         image_motion = removed.image_motion
-    elif followed is not None:
-        image_motion = followed.vibration.image_motion[report.first]
+    elif report.windows is not None:
+        followed = report.windows.followed()
+        image_motion = image_motion if followed is None else followed.vibration.image_motion[report.first]
     # an image that was restored jointly from all frames is compared with the one in the middle
     index = count // 2 if finer is not None and len(finer) < count else 0
     figures = [(name, text, figure_png(figure, dpi=140)) for name, text, figure in figures_of(report, index, removed)]
@@ -229,9 +225,8 @@ def write_report_page(folder: Path, report: Report) -> list[str]:
         points = finer.shape[-1] // report.frames.shape[-1]
         report = replace(report, restored=finer[..., ::points, ::points])
     mark, sentence = headline(report)
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
+    options: Table = {"autoescape": True, "undefined": jinja2.StrictUndefined}
+    environment = jinja2.Environment(**options, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string(Path(__file__).with_name("report.html").read_text(encoding="utf-8"))
     text = template.render(
         report=report,
