@@ -253,7 +253,7 @@ def restore_frames(given: RestoreOptions) -> Answer:
     if detected is None:
         answer = answers.windows_answer("Vibration", stacks.read_manifest(run.manifest))
     else:
-        answer = Answer({"Vibration": [detected.summary()]}, {"detection": detected.to_dict()})
+        answer = Answer({"Vibration": [detected.summary()]}, {"detection": answers.detection_data(detected)})
         answer.next_steps += [answers.page_step(frames, frames.with_name("report"), settings)] * run.restored
     answer.results["Restoration"], answer.data["restoration"] = lines, data
     if report is not None and first is not None:
