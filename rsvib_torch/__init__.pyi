@@ -24,8 +24,6 @@ from .detection import detect_motion as detect_motion
 from .detection import detect_swept_tone as detect_swept_tone
 from .detection import detect_vibration as detect_vibration
 from .evaluation import MtfCurve as MtfCurve
-from .evaluation import SlantedEdge as SlantedEdge
-from .evaluation import find_slanted_edges as find_slanted_edges
 from .evaluation import psnr as psnr
 from .evaluation import slanted_edge_mtf as slanted_edge_mtf
 from .evaluation import ssim as ssim
@@ -63,18 +61,15 @@ from .motion.vibration import blind_frequencies as blind_frequencies
 from .registration import OffsetCurve as OffsetCurve
 from .registration import register_bands as register_bands
 from .report import comparison_figure as comparison_figure
-from .report import gain_figure as gain_figure
 from .report import motion_figure as motion_figure
 from .report import mtf_figure as mtf_figure
 from .report import offset_figure as offset_figure
 from .report import psf_figure as psf_figure
 from .report import read_vibration as read_vibration
-from .report import rows_figure as rows_figure
 from .report import save_figure as save_figure
 from .report import windows_figure as windows_figure
 from .report import write_offsets as write_offsets
 from .report import write_table as write_table
-from .report import write_vibration as write_vibration
 from .restoration import FixedDewarp as FixedDewarp
 from .restoration import RestorationMtf as RestorationMtf
 from .restoration import RestorationVerdict as RestorationVerdict

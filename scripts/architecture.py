@@ -6,7 +6,7 @@ LAYERS: tuple[dict[str, str], ...] = (
     {"commands": "the rsvib program: options, progress, output on the terminal"},
     {"video": "process_video.py: videos in two passes; steadying.py; session.py: a running camera"},
     {
-        "report": "results on disk: JSON, CSV, figures (plots.py), HTML page (html/)",
+        "report": "results on disk: JSON, CSV, figures (plots.py), HTML page (page.py)",
         "export": "motions for other programs: angular rates",
     },
     {"config": "TOML files ↔ groups of options"},
@@ -57,7 +57,7 @@ INNER_LAYERS: dict[str, tuple[set[str], ...]] = {
         {"detect"},
     ),
     "evaluation": ({"quality", "mtf", "bound"},),
-    "report": ({"results", "plots"}, {"html"}),
+    "report": ({"results", "plots"}, {"page"}),
     "restoration": (
         {"frame_motion", "restoration_warning"},
         {"scene_model"},

@@ -102,12 +102,11 @@ def run(name: str, options: argparse.Namespace, arguments: Sequence[str], consol
             subtitle=f"2 simulated frames of {size[0]} x {size[1]} px with the camera of Liu et al. 2023",
             frames=frames,
             restored=restored,
-            was_restored=True,
             timing=TIMING,
             detection=detection,
             verdict=verdict,
-            version=rsv.__version__,
-            command=shlex.join(["python", "scripts/demo.py", *arguments]),
+            texts={"Detected vibration": detection.summary(), "Restoration": verdict.summary()},
+            made_with=f"rsvib_torch {rsv.__version__}: {shlex.join(['python', 'scripts/demo.py', *arguments])}",
         )
         write_report_page(folder / "report", report)
         summary = {"scene": name, "seed": options.seed, "frame_size": size, "rim": RIM, "vibration": lines}

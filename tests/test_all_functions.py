@@ -101,7 +101,6 @@ CASES = (
         "calibrate_row_time": (lambda frames: rsv.calibrate_row_time(frames, 1000.0), FLICKER),
         "detect_vibration": (detect, FRAMES),
         "detect_vibration, ignore": (lambda frames, ignore: detect(frames, ignore=ignore), FRAMES, FRAMES > 0.95),
-        "find_slanted_edges": (rsv.find_slanted_edges, EDGE),
         "slanted_edge_mtf": (rsv.slanted_edge_mtf, EDGE),
         "judge_restoration": (partial(rsv.judge_restoration, timing=TIMING, vibration=VIBRATION), FRAMES, FRAMES),
         "psnr": (lambda *images: rsv.psnr(*images, 1.0), FRAMES, FRAMES.flip(0)),

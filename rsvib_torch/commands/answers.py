@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -149,7 +150,7 @@ def steps_after_detection(
 
 def page_step(frames: Path, out: Path, settings: Config, *more: str | Path) -> str:
     """The step to write a page about a restored stack."""
-    sentence = "write a page with all figures and the sharpness before and after"
+    sentence = "write a page with all figures"
     return next_step(sentence, "report", frames, out, *settings.arguments, *more)
 
 
@@ -189,7 +190,7 @@ def write_detection(
 ) -> list[str]:
     """Write a detection as JSON, tables and figures, and return the names of the files."""
     with working("drawing the offset curve"):
-        reports.write_vibration(folder / "vibration.json", result, timing)
+        replace(result, timing=timing).save(folder / "vibration.json")
         reports.write_table(folder / "tones.csv", result, pixel_size=pixel_size)
         reports.write_offsets(folder / "offsets.csv", result)
         drawn = draw_safely(folder / "offsets.png", lambda: reports.offset_figure(result))

@@ -56,7 +56,7 @@ def export(given: ExportOptions) -> Answer:
         raise ValueError(f"the format of {out.name} is not known from its name: give --format gcsv or csv")
     frames = [] if given.frames is None else io.stack_files(given.frames)
     check_file(out, given.overwrite, [given.vibration, *frames])
-    detected = reports.load_detection(given.vibration)
+    detected = reports.read_vibration(given.vibration)
     if chosen == "csv":
         reports.write_offsets(out, detected)
         lines = []  # for each axis, root mean square of the offsets and of the residuals

@@ -48,7 +48,8 @@ _EXAMPLES = """
   rsvib restore frames.tif still.tif --config camera.toml \\
         --vibration found/vibration.json --joint all
   rsvib report frames.tif report --config camera.toml
-  rsvib report chart.tif report --config camera.toml --edge 200,340,60,40
+  rsvib report frames.tif report --config camera.toml \\
+        --manifest results/manifest.json
   rsvib motion frames.tif --config camera.toml --out motion.csv
   rsvib motion frames.tif --config camera.toml --out swept.csv --model swept
   rsvib known frames.tif restored.tif --config camera.toml \\

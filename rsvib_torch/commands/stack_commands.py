@@ -253,7 +253,7 @@ def restore_frames(given: RestoreOptions) -> Answer:
     if detected is None:
         answer = answers.windows_answer("Vibration", stacks.read_manifest(run.manifest))
     else:
-        answer = Answer({"Vibration": [detected.summary()]}, {"detection": detected.to_dict()})
+        answer = Answer({"Vibration": [detected.summary()]}, {"detection": answers.detection_data(detected)})
         answer.next_steps += [answers.page_step(frames, frames.with_name("report"), settings)] * run.restored
     answer.results["Restoration"], answer.data["restoration"] = lines, data
     if report is not None and first is not None:
@@ -283,8 +283,6 @@ class ReportOptions(shared.RestorationCommand, shared.VerdictOptions):
 
     out: Path = argument()
     """Folder for report.html and its figures."""
-    edge: list[str] | None = option(None, metavar="EDGE", show_default="edges are searched for")
-    """Slanted edge to measure: TOP,LEFT,HEIGHT,WIDTH in px; may be given several times."""
     manifest: Path | None = None
     """The manifest.json of rsvib run or detect with windows: draw amplitude and frequency over the windows. The page of
     a run that followed the vibration shows the frames of that run, and detects nothing anew."""
@@ -298,7 +296,6 @@ def report(given: ReportOptions) -> Answer:
     Detection, restoration and verdict are those of rsvib run. The page needs no network; figures are also PNG files.
     """
     settings, frames, out = given.settings, given.stack, given.out
-    list(map(_edge_box, given.edge or ()))  # errors before anything is computed
     windows = None if given.manifest is None else stacks.read_manifest(given.manifest)
     inputs = [*given.inputs, *([] if given.manifest is None else [given.manifest])]
     answers.check_folder(out, ["report.html"], given.overwrite, inputs)
@@ -330,14 +327,11 @@ def report(given: ReportOptions) -> Answer:
     page = reports.Report(
         **_page_head(given, windows),
         frames=pixels if pattern is None else preparation.colour_frames(pixels, pattern),
-        restored=result.frames,
-        was_restored=result.restored,
+        restored=result.frames if result.restored else None,
         timing=timing,
         detection=detection,
         verdict=result.verdict,
-        left_alone=result.left_alone,
-        options=options,
-        next_steps=tuple(steps),
+        next_steps=steps,
     )
     return _write_page(given, page, answer)
 
@@ -355,7 +349,6 @@ def _report_of_run(given: ReportOptions, windows: stacks.StackManifest, made: Pa
         **_page_head(given, windows),
         frames=before if windows.margins is None else video.Margins(**windows.margins).cut(before),
         restored=after,
-        was_restored=True,
         timing=given.settings.timing,
         first=first,
     )
@@ -367,8 +360,7 @@ def _page_head(given: ReportOptions, windows: stacks.StackManifest | None) -> Ta
     return {
         "title": printable(f"Vibration in {given.stack.name}"),
         "subtitle": printable(f"{given.stack}, camera of {given.settings.source}"),
-        "version": rsvib_torch.__version__,
-        "command": current_output().command,
+        "made_with": f"rsvib_torch {rsvib_torch.__version__}: {current_output().command}",
         "windows": windows,
     }
 
@@ -376,17 +368,12 @@ def _page_head(given: ReportOptions, windows: stacks.StackManifest | None) -> Ta
 def _write_page(given: ReportOptions, page: reports.Report, answer: Answer) -> Answer:
     """Write a page, and add its files to the answer."""
     inputs = [*given.inputs, *([] if given.manifest is None else [given.manifest])]
+    texts = {title: "\n".join(lines) for title, lines in answer.results.items()}
+    if page.windows is not None and page.detection is not None:
+        texts["Windows of the stack"] = page.windows.summary()
+    page = replace(page, texts=texts)
     with whole_folder(given.out) as folder, working("writing the page"):
-        files = reports.write_report_page(folder, page, list(map(_edge_box, given.edge or ())) or None)
+        files = reports.write_report_page(folder, page)
         shared.check_new([given.out / name for name in files], overwrite=True, inputs=inputs)
     answer.files += [given.out / name for name in files]
     return answer
-
-
-def _edge_box(text: str) -> reports.Box:
-    """Position of a slanted edge (top, left, height, width) in px."""
-    numbers = [int(part) for part in text.split(",") if part.strip().isdecimal()]
-    if len(numbers) != 4 or text.count(",") != 3:
-        raise ValueError(f"--edge must be TOP,LEFT,HEIGHT,WIDTH in px, got {text!r}")
-    top, left, height, width = numbers
-    return top, left, height, width

@@ -1,17 +1,13 @@
-from .html.page import Box as Box
-from .html.page import write_report_page as write_report_page
-from .html.words import Report as Report
+from .page import Report as Report
+from .page import write_report_page as write_report_page
 from .plots import comparison_figure as comparison_figure
-from .plots import gain_figure as gain_figure
 from .plots import motion_figure as motion_figure
 from .plots import mtf_figure as mtf_figure
 from .plots import offset_figure as offset_figure
 from .plots import psf_figure as psf_figure
-from .plots import rows_figure as rows_figure
 from .plots import save_figure as save_figure
 from .plots import windows_figure as windows_figure
 from .results import check_same_timing as check_same_timing
-from .results import load_detection as load_detection
 from .results import motion_columns as motion_columns
 from .results import read_vibration as read_vibration
 from .results import restoration_data as restoration_data
@@ -19,4 +15,3 @@ from .results import write_columns as write_columns
 from .results import write_offsets as write_offsets
 from .results import write_restoration as write_restoration
 from .results import write_table as write_table
-from .results import write_vibration as write_vibration

@@ -24,6 +24,7 @@ from rsvib_torch.checks.values import check_single
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.detection.spectrum import SMALLEST_SHOWN
 from rsvib_torch.evaluation import MtfCurve
+from rsvib_torch.files.atomic import whole_file
 from rsvib_torch.files.reading import Table
 from rsvib_torch.imaging import row_psf
 from rsvib_torch.imaging.trajectory import exposure_nodes
@@ -31,12 +32,12 @@ from rsvib_torch.motion.detected_vibration import DetectedVibration, FollowedVib
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.motion.vibration import Vibration, blind_frequencies
+from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.numerics.tables import Array, true_runs
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.restoration import RestorationMtf, RestorationVerdict
 from rsvib_torch.results.presentation import AXIS_NAMES, AXIS_UNITS, FIGURES
-from rsvib_torch.results.result_files import figure_png, write_figure
+from rsvib_torch.results.result_files import figure_png
 from rsvib_torch.row_time import RowTimeCalibration
 from rsvib_torch.stacks import StackManifest
 from rsvib_torch.text import measured_text
@@ -63,16 +64,6 @@ class _Drawing(Figure):
         return figure_png(self, dpi=90)
 
 
-def tones_text(result: DetectionResult, axis: int) -> list[str]:
-    """Amplitude and frequency of every tone of an axis, one text each."""
-    vibration, std = result.vibration, result.std
-    return [
-        f"{measured_text(vibration.amplitude[axis, tone], std.amplitude[axis, tone])} {AXIS_UNITS[axis]} at "
-        f"{measured_text(vibration.frequency[axis, tone], std.frequency[axis, tone])} Hz"
-        for tone in vibration.amplitude[axis].nonzero()[:, 0].tolist()
-    ]
-
-
 @checks_arguments
 def save_figure(
     figure: Figure, path: str | os.PathLike[str], *, dpi: Annotated[int, Field(ge=1, le=10_000)] = 150
@@ -84,7 +75,8 @@ def save_figure(
         path: The file to write; its ending selects the format (``.png``, ``.svg``, ``.pdf``).
         dpi: Pixels per inch.
     """
-    write_figure(figure, path, dpi)
+    with whole_file(path) as part:
+        figure.savefig(part, dpi=dpi, facecolor="white")
 
 
 def plain_axes(panel: Axes, x: str = "", y: str = "", *, title: str = "", heading: str = "") -> None:
@@ -201,24 +193,6 @@ def _draw_offsets(upper: Axes, lower: Axes, result: DetectionResult, axis: int) 
     return points
 
 
-def offset_panels(result: DetectionResult, axes: Sequence[int], width: float, height: float) -> tuple[Figure, Panels]:
-    """Figure of the offsets of some axes with their fit and residuals, and its panels (2, axes)."""
-    check_single("result", result.batch_shape)
-    sharex = len(result.offsets.pairs) <= _MOST_PAIRS or "row"  # all pairs are shown, or only below
-    figure, panels = _panels(width, height, 2, len(axes), sharex=sharex, height_ratios=(3, 1))
-    points = [_draw_offsets(panels[0, column], panels[1, column], result, axis) for column, axis in enumerate(axes)]
-    _legend_below(
-        figure,
-        _symbol("measured rows", color=_QUALITY_COLOURS(1.0), markersize=5),
-        _symbol("detected vibration", color=_FIT_COLOUR, marker="", linewidth=1.3),
-        _symbol("not measured", color=_GREY, marker="x", markersize=5),
-    )
-    bar = figure.colorbar(points[-1], ax=panels, fraction=0.025, pad=0.01)
-    bar.set_label("quality (0: outlier)", color=_INK)
-    bar.outline.set_visible(False)
-    return figure, panels
-
-
 @checks_arguments
 def offset_figure(result: DetectionResult) -> Figure:
     """Draw the offset curve of each axis with its fit, and the residuals (as Figure 6 of Liu et al. 2023).
@@ -234,16 +208,32 @@ def offset_figure(result: DetectionResult) -> Figure:
         >>> [panel.get_ylabel() for panel in offset_figure(rsv.detect_vibration(frames, timing, method="bands")).axes]
         ['offset (px)', 'offset (px)', 'residual (px)', 'residual (px)', 'quality (0: outlier)']
     """
-    axes = result.vibration.num_axes
-    figure, panels = offset_panels(result, range(axes), 6.5 * axes, 6.4)
-    for axis, (name, upper) in enumerate(zip(AXIS_NAMES, panels[0], strict=False)):
+    check_single("result", result.batch_shape)
+    vibration, std, axes = result.vibration, result.std, result.vibration.num_axes
+    sharex = len(result.offsets.pairs) <= _MOST_PAIRS or "row"  # all pairs are shown, or only below
+    figure, panels = _panels(6.5 * axes, 6.4, 2, axes, sharex=sharex, height_ratios=(3, 1))
+    for axis, (name, upper, lower) in enumerate(zip(AXIS_NAMES, *panels, strict=False)):
+        points = _draw_offsets(upper, lower, result, axis)
         upper.set_title(f"Offset along {name}" if axis < 2 else f"Offset of {name}", **_HEADING, pad=36)
-        text = ",  ".join(tones_text(result, axis))
+        text = ",  ".join(
+            f"{measured_text(vibration.amplitude[axis, tone], std.amplitude[axis, tone])} {AXIS_UNITS[axis]} at "
+            f"{measured_text(vibration.frequency[axis, tone], std.frequency[axis, tone])} Hz"
+            for tone in vibration.amplitude[axis].nonzero()[:, 0].tolist()
+        )
         if not bool(result.reliable[axis]):
             text = "not reliable: " + "; ".join(str(reason) for reason in result.reasons[axis])
         text = "\n".join(textwrap.wrap(text, 76, max_lines=2, placeholder=" …"))
         note = upper.annotate(text, (0, 1), (0, 32), "axes fraction", "offset points", va="top", fontsize=9.5)
         note.set_in_layout(False)  # a long text would reduce the size of the panels
+    _legend_below(
+        figure,
+        _symbol("measured rows", color=_QUALITY_COLOURS(1.0), markersize=5),
+        _symbol("detected vibration", color=_FIT_COLOUR, marker="", linewidth=1.3),
+        _symbol("not measured", color=_GREY, marker="x", markersize=5),
+    )
+    bar = figure.colorbar(points, ax=panels, fraction=0.025, pad=0.01)
+    bar.set_label("quality (0: outlier)", color=_INK)
+    bar.outline.set_visible(False)
     return figure
 
 
@@ -382,77 +372,6 @@ def _verdict_figure(verdict: RestorationVerdict) -> Figure:
 
 
 @checks_arguments
-def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
-    """Draw the offset gain of a pair of frames over frequency, and the detected tones with two standard deviations.
-
-    The offset gain is ``|2 sin(pi f m T_row) sinc(f T_e)|``, px of offset per px of displacement (Eqs. 2 and 7 of Liu
-    et al. 2023). Blind frequencies are dashed lines.
-
-    Example:
-        >>> import rsvib_torch as rsv
-        >>> frames, timing, _ = rsv.datasets.example_frames()
-        >>> gain_figure(rsv.detect_vibration(frames, timing, method="bands"), timing).axes[-1].get_xlabel()
-        'frequency (Hz)'
-    """
-    check_single("result", result.batch_shape)
-    vibration, std = result.vibration, result.std
-    highest = max(1.35 * float((vibration.frequency * (vibration.amplitude > 0)).max()), 4.2 / timing.frame_period)
-    frequency = np.linspace(0.0, highest, 2000)
-    gain = np.abs(2 * np.sin(np.pi * frequency * timing.frame_period) * np.sinc(frequency * timing.exposure_time))
-    figure, ((upper,), (lower,)) = _panels(5.6, 4.6, 2, sharex=True, height_ratios=(1.2, 1))
-    upper.plot(frequency, gain, color="#555555", linewidth=1.2)
-    for panel in (upper, lower):
-        for blind in blind_frequencies(timing, highest).tolist():
-            panel.axvline(blind, color=_GREY, linewidth=0.8, linestyle="--", zorder=0)
-    labels: Table = {}
-    for axis, tone in vibration.amplitude[:2].nonzero().tolist():
-        name, reliable = "xy"[axis], bool(result.reliable[axis])
-        style = _marker(_AXIS_COLOURS[name], reliable) | {"markersize": 6}
-        at, amplitude = float(vibration.frequency[axis, tone]), float(vibration.amplitude[axis, tone])
-        tone_gain = abs(float(result.gain[axis, tone])) * abs(float(np.sinc(at * timing.exposure_time)))
-        labels[name if reliable else f"{name} (not reliable)"] = upper.plot(at, tone_gain, **style)[0]
-        bars = [_error_bar(values[axis, tone]) for values in (std.amplitude, std.frequency)]
-        lower.errorbar(at, amplitude, *bars, capsize=3, elinewidth=1.4, **style)
-    if labels:
-        upper.legend(list(labels.values()), list(labels), **_LEGEND, loc="upper right", ncols=2)
-    upper.set(xlim=(0, highest), ylim=(0, 2.4))
-    lower.set_ylim(0, 1.15 * lower.get_ylim()[1])
-    plain_axes(upper, y="offset gain (px per px)")
-    plain_axes(lower, "frequency (Hz)", "amplitude (px)")
-    return figure
-
-
-def motion_blur(vibration: Motion, starts: Tensor, timing: SensorTiming) -> Tensor:
-    """Range of the displacement during the exposure of rows, (..., 2) in px, that start at (...) seconds."""
-    nodes, _ = exposure_nodes(timing, "gauss", 16)
-    ends = torch.tensor([0.0, timing.exposure_time], dtype=torch.float64, device="cpu")
-    path = vibration.displacement(starts[..., None] + torch.cat([ends, nodes.cpu()]).to(starts.device))
-    return path.amax(-2) - path.amin(-2)
-
-
-@checks_arguments
-def rows_figure(vibration: Motion, timing: SensorTiming, num_rows: Count) -> Figure:
-    """Draw mean displacement and motion blur of every row of frame 0.
-
-    Example:
-        >>> timing = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
-        >>> figure = rows_figure(Vibration([3.1, 5.2], [50.0, 30.0]), timing, num_rows=512)
-        >>> [panel.get_ylabel() for panel in figure.axes]
-        ['displacement (px)', 'motion blur (px)']
-    """
-    check_single("vibration", vibration.batch_shape)
-    vibration = vibration.detached()
-    starts = timing.row_starts(1, num_rows)[0]
-    figure, ((upper,), (lower,)) = _panels(5.6, 4.6, 2, sharex=True)
-    _plot_axes(upper, np.arange(num_rows), vibration.mean_displacement(starts, timing.exposure_time))
-    _plot_axes(lower, np.arange(num_rows), motion_blur(vibration, starts, timing), legend=False)
-    plain_axes(upper, "", "displacement (px)")
-    plain_axes(lower, "row (in readout order)", "motion blur (px)")
-    lower.set_ylim(bottom=0)
-    return figure
-
-
-@checks_arguments
 def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: Count) -> Figure:
     """Draw point spread functions of 24 rows of frame 0 with the path of the image during their exposure.
 
@@ -490,30 +409,23 @@ def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: Count) -> Figu
 
 
 @checks_arguments
-def mtf_figure(curves: Mapping[str, Sequence[MtfCurve]], *, points: Mapping[str, int] | None = None) -> Figure:
+def mtf_figure(curves: Mapping[str, Sequence[MtfCurve]]) -> Figure:
     """Draw modulation transfer functions of slanted edges: thin lines for the edges, a bold line for their mean.
 
     Args:
         curves: Measured edges of the input and of the restored frame, or of one image, by the name in the legend.
-        points: Points per px of those images that are on a finer grid, by name. Frequencies are in cycles per px, up to
-            the Nyquist frequency of the finest grid, in which that of the pixels is marked.
 
     Example:
         >>> figure = mtf_figure({"raw": [raw_curve], "restored": [restored_curve]})  # doctest: +SKIP
     """
     figure, ((panel,),) = _panels(5.6, 3.9)
-    points = points or {}
-    highest = 0.5 * max([1, *points.values()])
-    frequency = torch.linspace(0, highest, 101, dtype=torch.float64, device="cpu")
+    frequency = torch.linspace(0, 0.5, 101, dtype=torch.float64, device="cpu")
     for colour, (name, edges) in zip((_GREY, _X_COLOUR)[-len(curves) :], curves.items(), strict=True):
-        values = [edge.at(frequency.to(edge.lsf.device) / points.get(name, 1)).cpu() for edge in edges]
+        values = [edge.at(frequency.to(edge.lsf.device)).cpu() for edge in edges]
         for value in values:
             panel.plot(frequency, value, color=colour, linewidth=0.7, alpha=0.5)
-        if values:
-            panel.plot(frequency, torch.stack(values).mean(0), color=colour, linewidth=2.0, label=name)
-    _finish_mtf(panel, highest, "MTF")
-    if highest > 0.5:
-        panel.text(0.51, 1.0, "Nyquist frequency of the pixels", fontsize=8, color=_GREY)
+        panel.plot(frequency, torch.stack(values).mean(0), color=colour, linewidth=2.0, label=name)
+    _finish_mtf(panel, 0.5, "MTF")
     return figure
 
 

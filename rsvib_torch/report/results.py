@@ -4,7 +4,6 @@ import csv
 import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,6 @@ from rsvib_torch.checks.values import check_single
 from rsvib_torch.detection import DetectionResult, MotionDetection, SweptTone
 from rsvib_torch.files.atomic import whole_file, write_json
 from rsvib_torch.files.reading import Table
-from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.results.presentation import Result, plain_values
 from rsvib_torch.results.result_files import result_of
@@ -27,27 +25,11 @@ from rsvib_torch.text import quoted
 
 
 @checks_arguments
-def write_vibration(path: str | os.PathLike[str], result: DetectionResult, timing: SensorTiming | None = None) -> None:
-    """Write a detection as ``vibration.json``: vibration, standard deviations, verdict, offset curve and timing.
+def read_vibration(path: str | os.PathLike[str], timing: SensorTiming | None = None) -> DetectionResult:
+    """Read one detection from a ``vibration.json``, as the program does.
 
     Args:
-        path: The file to write; an existing file is replaced.
-        result: A detection (not a batch).
-        timing: The sensor; by default ``result.timing``.
-    """
-    check_single("result", result.batch_shape)
-    timing = timing or result.timing
-    if timing is None:
-        raise ValueError("timing unknown: pass timing=SensorTiming(...) of the frames")
-    replace(result, timing=timing).save(path)
-
-
-@checks_arguments
-def read_vibration(path: str | os.PathLike[str], timing: SensorTiming | None = None) -> DetectedVibration:
-    """Read a ``vibration.json``, as ``restore`` needs it; ``DetectionResult.load`` also reads its offset curve.
-
-    Args:
-        path: A file written by ``write_vibration``, ``DetectionResult.save`` or the program.
+        path: A file that the program or ``DetectionResult.save`` wrote.
         timing: The sensor of the frames to be restored, which must be that of the file; None not to compare them.
 
     Raises:
@@ -59,27 +41,21 @@ def read_vibration(path: str | os.PathLike[str], timing: SensorTiming | None = N
         >>> from rsvib_torch.datasets import example_frames
         >>> frames, timing, _ = example_frames()
         >>> path = tempfile.mkdtemp() + "/vibration.json"
-        >>> rsv.write_vibration(path, rsv.detect_vibration(frames, timing))
+        >>> rsv.detect_vibration(frames, timing).save(path)
         >>> rsv.read_vibration(path, timing).vibration.frequency[:, 0].round().tolist()  # Hz
         [110.0, 90.0]
     """
-    result = load_detection(Path(path))
-    if timing is not None and result.timing is not None:
-        check_same_timing(str(path), result.timing, timing)
-    return DetectedVibration.of(result)
-
-
-def load_detection(path: Path) -> DetectionResult:
-    """Read a ``vibration.json``; an error states what to give instead of other files."""
-    data = read_json(path, "vibration.json")
+    data = read_json(Path(path), "vibration.json")
     if data.get("format") != DetectionResult.file_format:
         raise ValueError(
             f"{path}: not a vibration.json, but a file of the format {quoted(data.get('format'))}; give the "
             "vibration.json, or the manifest.json of windows, that rsvib detect or run wrote"
         )
-    result = result_of(DetectionResult, data, path)
+    result = result_of(DetectionResult, data, Path(path))
     if result.batch_shape:
         raise ValueError(f"{path}: a batch of detections; read it with DetectionResult.load, and pass one of them")
+    if timing is not None and result.timing is not None:
+        check_same_timing(str(path), result.timing, timing)
     return result
 
 

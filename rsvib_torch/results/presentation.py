@@ -8,13 +8,12 @@ import html
 import itertools
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -23,15 +22,13 @@ from rsvib_torch.checks.validation import read_json
 from rsvib_torch.checks.values import check_number, described, needed_package
 from rsvib_torch.files.atomic import write_json
 from rsvib_torch.files.reading import Table
-from rsvib_torch.numerics.tables import Array
 from rsvib_torch.results.higher_packages import IMPORTERS
 from rsvib_torch.results.reason import Findings, texts
-from rsvib_torch.results.result_files import figure_png, result_of, write_figure
+from rsvib_torch.results.result_files import figure_png, result_of
 from rsvib_torch.text import AXES, data_uri, text_table, wrapped
 
 if TYPE_CHECKING:
     import pandas
-    import xarray
     from matplotlib.figure import Figure
 
 # The function that draws a result of this type with this number of leading dimensions (0: not a batch).
@@ -126,10 +123,6 @@ def check_pixel_size(pixel_size: float | None) -> float | None:
         return None
     # a pixel of 1 km shows the Earth in 12,742 px; 1 nm is a tenth of the smallest structures of light microscopes
     return check_number("pixel_size (in m)", pixel_size, at_least=1e-9, at_most=1e3)
-
-
-_DIMENSIONS = {"A": "axis", "F": "frequency", "K": "tone", "N": "row", "P": "pair", "R": "row", "T": "frame"}
-Variable = tuple[tuple[str, ...], Array, dict[str, str]]  # names of dimensions, values, attributes
 
 
 # Results
@@ -263,46 +256,13 @@ class Result(Summarised):
         ``to_pandas`` makes a frame of them, and ``write_table`` a CSV file. With the size of a pixel in m, in the plane
         in which the motion is wanted (sensor or object), columns in um, um/s and m/s^2 are added.
         """
-        raise TypeError(f"{type(self).__name__} has no table: use to_xarray(), which all results have, or to_dict()")
+        raise TypeError(f"{type(self).__name__} has no table: use to_dict(), which all results have")
 
     def to_pandas(self, *, pixel_size: float | None = None) -> "pandas.DataFrame":
         """``table`` as a ``pandas.DataFrame``; missing values are NaN."""
         package = needed_package("pandas", "to_pandas", "tables")
         frame: pandas.DataFrame = package.DataFrame(self.table(pixel_size=pixel_size))
         return frame
-
-    def to_xarray(self) -> "xarray.Dataset":
-        """The tensors as an ``xarray.Dataset`` with names of dimensions, and units.
-
-        The coordinates are ``axis`` and, from 1 on as in tables, ``tone``. Tensors of a result within this one have the
-        name of its field in front (``std_amplitude``); those of a motion have their own. ``index`` counts the results
-        of a batch.
-        """
-        package = needed_package("xarray", "to_xarray", "tables")
-        variables = dict(self._variables(()))
-        sizes: dict[str, int] = {}
-        for names, values, _ in variables.values():
-            sizes |= zip(names, values.shape, strict=True)
-        coordinates = {"axis": np.array(AXIS_NAMES[: sizes["axis"]], object)} if "axis" in sizes else {}
-        if "tone" in sizes:
-            coordinates["tone"] = np.arange(1, sizes["tone"] + 1)
-        dataset: xarray.Dataset = package.Dataset(variables, coordinates)
-        return dataset
-
-    def _variables(self, inside: tuple[str, ...]) -> Iterator[tuple[str, Variable]]:
-        """Names and values of the tensors for ``to_xarray``; ``inside`` names the fields around this result."""
-        for name, value in vars(self).items():
-            own = () if name in ("vibration", "motion") else (name,)
-            if isinstance(value, Result):
-                yield from value._variables((*inside, *own))
-            elif isinstance(value, Tensor) and name in self.shapes:
-                full = "_".join(dict.fromkeys((*inside, name)))  # offsets of the curve "offsets" are "offsets"
-                unit = {"units": self.units[name]} if name in self.units else {}
-                symbols = [entry for entry in self.shapes[name].split() if "..." not in entry]
-                batch = value.ndim - len(symbols)
-                dimensions = ["index"] if batch == 1 else [f"index_{number}" for number in range(batch)]
-                dimensions += [_DIMENSIONS.get(symbol, f"{full}_{symbol.lower()}") for symbol in symbols]
-                yield full, (tuple(dimensions), value.detach().cpu().numpy(), unit)
 
     def mapped(self, function: Callable[[Tensor], Tensor]) -> Self:
         """The same result with ``function``, which must preserve values, applied to every tensor.
@@ -335,7 +295,7 @@ class Result(Summarised):
             raise TypeError(f"{type(self).__name__} has no figure; these have one: {', '.join(drawn)}")
         figure = draw(self.mapped(lambda values: values.detach().cpu()))
         if path is not None:
-            write_figure(figure, path)
+            IMPORTERS["figures"]().save_figure(figure, path)
         return figure
 
     def _figure_function(self) -> "Callable[..., Figure] | None":
@@ -365,10 +325,3 @@ class JudgedResult(Result):
         for index in place:
             against = against[index]
         return " ".join(reason.code for reason in against)
-
-    def _variables(self, inside: tuple[str, ...]) -> Iterator[tuple[str, Variable]]:
-        for name, (dimensions, values, attributes) in super()._variables(inside):
-            yield name, (dimensions, values, attributes)
-            if name == "reliable" and dimensions[-1:] == ("axis",):
-                codes = np.array([self.codes(place) for place in np.ndindex(values.shape)], object)
-                yield "reasons", (dimensions, codes.reshape(values.shape), {})

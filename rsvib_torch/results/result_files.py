@@ -2,7 +2,6 @@
 
 import io
 import math
-import os
 import types
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
@@ -13,7 +12,6 @@ from torch import Tensor
 
 from rsvib_torch.checks.arguments import check_fields, hints_of
 from rsvib_torch.checks.values import members_of
-from rsvib_torch.files.atomic import whole_file
 from rsvib_torch.files.reading import Table
 from rsvib_torch.results.reason import read_findings
 from rsvib_torch.text import quoted
@@ -102,9 +100,3 @@ def figure_png(figure: "Figure", dpi: int) -> bytes:
     picture = io.BytesIO()
     figure.savefig(picture, dpi=dpi, facecolor="white", format="png")
     return picture.getvalue()
-
-
-def write_figure(figure: "Figure", path: str | os.PathLike[str], dpi: int = 150) -> None:
-    """Write a figure as an image file; its ending selects the format."""
-    with whole_file(path) as part:
-        figure.savefig(part, dpi=dpi, facecolor="white")

@@ -98,7 +98,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     pairs = torch.zeros(2, 3, dtype=torch.float64)
     values = (0.0, 1e-4, 1.0, 1e-4, unit, unit, 500.0, 1.0, 1e-4, 1e-6, pairs, unit, 0.01, unit[:2])
     rotation = rsv.RotationAlignment(recorded, "YxZ", *values, pairs, pairs, True, ())
-    rsv.write_vibration(folder / "vibration.json", detected)
+    detected.save(folder / "vibration.json")
     options: dict[str, Any] = {"detection": DETECTION, "restoration": {"method": "dewarp"}}
     options |= {"full_scale": None, "force": False, "device": "cpu"}
     windows = {"window": 3, "memory": "1GB", "workers": 1, **options}
@@ -115,7 +115,6 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     verdict = rsv.judge_restoration(frames, restored, timing, vibration)
     optics, sensor_noise = rsv.Optics(0.5, 0.4, 1.0), rsv.SensorNoise(5000.0, 0.01, 12, 0.01, 0.01, 0.01, 3)
     calibration = rsv.RowTimeCalibration(1e-4, 1e-6, 12.0, 0.3, 1000.0, 104.0, "forward", 1e-3, 1e-5, ())
-    slanted = rsv.SlantedEdge(0, 0, 64, 48, 5.0, True, "right", 0.6)
     info = rsv.read_stack_info(stack)
     figure = rsv.motion_figure(vibration)
     tracker = rsv.VibrationTracker(rsv.SensorTiming(1e-4, 6, 104), window=2)
@@ -182,7 +181,6 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
         "write_gcsv": {"path": new["rates.gcsv"], "motion": with_camera, "num_frames": 2},
         "write_offsets": {"path": folder / "offsets.csv"},
         "write_stack": {"path": folder / "written.tif", "like": info},
-        "write_vibration": {"path": folder / "written.json"},
         "write_table": {"path": folder / "tones.csv"},
     }
     functions = {name: getattr(rsv, name) for name in rsv.__all__ if inspect.isfunction(getattr(rsv, name))}
@@ -223,7 +221,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     result["FixedDewarp.forward"] = Call(rsv.FixedDewarp(timing, vibration, (96, 64), 3).forward, {"frames": frames})
     result["RollingShutterVibration.drawn_vibration"] = call(augmentation.drawn_vibration)
     report = rsv.process_stack(stack, folder / "again.npy", timing, **windows)
-    described = (detected.std, curve, optics, sensor_noise, slanted, info, report, verdict, calibration, camera)
+    described = (detected.std, curve, optics, sensor_noise, info, report, verdict, calibration, camera)
     described += (tracked, rsv.Margins(1, 2, 3, 4), rsv.restoration_mtf(frames, timing, vibration))
     described += (detected.spectrum(), rsv.CameraMode("A", "B", "", 1920, 1080, 30.0, 0.01, 1e-4, 3, "forward", 1080))
     of_frame = {one.name: getattr(detected, one.name) for one in fields(rsv.FollowedVibration) if one.name != "times"}

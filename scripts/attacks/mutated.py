@@ -124,7 +124,7 @@ def write_originals(folder: Path) -> dict[str, bytes]:
     options: dict[str, Any] = {"window": 3, "detection": DETECTION, "restoration": {"method": "dewarp"}, "workers": 1}
     rsv.process_stack(folder / "own.tif", folder / "out.npy", TIMING, **options)
     detected = rsv.detect_vibration(frames, TIMING, **DETECTION)
-    rsv.write_vibration(folder / "vibration.json", detected)
+    detected.save(folder / "vibration.json")
     detected.save(folder / "detection.json")
     rsv.detect_motion(frames, TIMING, **BANDS).motion.save(folder / "free.json")
     rsv.detect_swept_tone(frames, TIMING, **BANDS).save(folder / "swept.json")

@@ -98,7 +98,16 @@ PITCH = 2  # samples of the scene per pixel
 BORDER = 32  # px of scene beyond the largest displacement, over which it fades so that it is periodic
 OPTICS = 0.5  # px; sigma of the Gaussian optics, in addition to square pixels
 SEED, BITS = 2023, 12
-RIM, EDGE_RIM = 32, 40  # px at the border that are not evaluated, because they are partly outside the frame
+RIM = 32  # px at the border that are not evaluated, because they are partly outside the frame
+# Strong slanted edges of the chart by the size of the frames, 40 px or more from the border: those that measure x (near
+# the vertical), and those that measure y; top, left, height and width of each in px.
+EDGES = {
+    (2048, 1024): {
+        "x": ((1192, 628, 112, 59), (1203, 752, 112, 58), (745, 338, 112, 58)),
+        "y": ((1286, 657, 59, 113), (827, 244, 59, 112), (1515, 48, 59, 112)),
+    },
+    (512, 384): {"x": ((316, 244, 37, 20),), "y": ((190, 85, 20, 38),)},
+}
 MTF_FREQUENCY = np.linspace(0.0, 0.5, 51)  # cycles/px; every fifth value is stored
 SHOWN = {"at 0.25 cycles/px": 5, "at 0.4": 8, "at Nyquist": 10}  # places of stored values
 
@@ -148,15 +157,18 @@ def counts_of(frames: Array, noise: float, seed: int) -> Array:
 # Slanted edges
 
 
-def edges_of(still: Array, count: int) -> list[tuple[str, rsv.SlantedEdge]]:
-    """The strongest slanted edges of the chart at rest for each axis (x: near-vertical), away from its border."""
-    height, width = still.shape
-    inside = [
-        edge
-        for edge in rsv.find_slanted_edges(torch.from_numpy(still))
-        if min(edge.top, edge.left, height - edge.top - edge.height, width - edge.left - edge.width) >= EDGE_RIM
+Edge = tuple[slice, slice]  # rows and columns
+
+
+def edges_of(size: tuple[int, ...], count: int) -> list[tuple[str, Edge]]:
+    """The strongest slanted edges of the chart for each axis."""
+    if size not in EDGES:
+        raise ValueError(f"no edges are known for frames of {size} px; add them to EDGES, or pass --trial-edges 0")
+    return [
+        (axis, (slice(top, top + height), slice(left, left + width)))
+        for axis in AXES
+        for top, left, height, width in EDGES[size][axis][:count]
     ]
-    return [(axis, edge) for axis in AXES for edge in [e for e in inside if e.near_vertical == (axis == "x")][:count]]
 
 
 def straight_edge_mtf(roi: Array, frequency: Array) -> Array:
@@ -197,11 +209,11 @@ def straight_edge_mtf(roi: Array, frequency: Array) -> Array:
     return response / np.maximum(np.sinc(2 * frequency / finer) * np.sinc(frequency / finer), 0.1)
 
 
-def mtf_curves(image: Array, edges: Sequence[tuple[str, rsv.SlantedEdge]]) -> dict[str, list[float]]:
+def mtf_curves(image: Array, edges: Sequence[tuple[str, Edge]]) -> dict[str, list[float]]:
     """Mean MTF over the edges of each axis, every fifth value."""
     found = {}
     for axis in AXES if edges else ():
-        rois = [np.asarray(edge.crop(image)) for of_axis, edge in edges if of_axis == axis]
+        rois = [image[edge] for of_axis, edge in edges if of_axis == axis]
         curves = [straight_edge_mtf(roi if axis == "x" else roi.T, MTF_FREQUENCY) for roi in rois]
         found[axis] = np.mean(curves, axis=0)[::5].tolist()
     return found
@@ -224,7 +236,7 @@ def detection_values(result: Any, shake: Shake) -> dict[str, dict[str, Any]]:
     return values
 
 
-def quality(images: Array, still: Array, edges: Sequence[tuple[str, rsv.SlantedEdge]]) -> Rows:
+def quality(images: Array, still: Array, edges: Sequence[tuple[str, Edge]]) -> Rows:
     """PSNR and SSIM (of scikit-image) and MTF of each frame."""
     inner = (slice(RIM, -RIM), slice(RIM, -RIM))
     window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
@@ -243,7 +255,7 @@ def quality(images: Array, still: Array, edges: Sequence[tuple[str, rsv.SlantedE
 
 
 def trials(
-    scene: Scene, case: dict[str, Any], noises: Sequence[float], edges: Sequence[tuple[str, rsv.SlantedEdge]] | None
+    scene: Scene, case: dict[str, Any], noises: Sequence[float], edges: Sequence[tuple[str, Edge]] | None
 ) -> Rows:
     """Detection and restoration of two frames by all methods for all noises; without edges (None) detection only."""
     shake = shake_of(case["seed"], case["speed"] * (-1) ** case["seed"])
@@ -277,7 +289,8 @@ def rows(options: argparse.Namespace) -> Rows:
     with one_thread():
         for target in TARGETS:
             scene = draw(target, options.trial_size)
-            edges = edges_of(scene.still, options.trial_edges) if target == "chart" else []
+            measured = options.trial_edges if target == "chart" else 0
+            edges = edges_of(scene.still.shape, measured) if measured else []
             case: dict[str, Any] = {"target": target, "speed": 0.0}
             for noise in options.trial_noises:
                 still = quality(counts_of(scene.still[None], noise, 0), scene.still, edges)

@@ -1,4 +1,4 @@
-"""Slanted-edge MTF against the analytic MTF of optics and square pixels, and detection of the edges of a chart."""
+"""Slanted-edge MTF against the analytic MTF of optics and square pixels."""
 
 import math
 
@@ -8,11 +8,9 @@ import torch
 from edge_truth import OPTICS, draw_edge, draw_edge_of, gaussian, mtf50_of, through_pixels
 from refusals import refuses
 from scipy.integrate import dblquad
-from scipy.ndimage import rotate
 from scipy.special import ndtr
 
 import rsvib_torch as rsv
-from rsvib_torch.datasets import city_and_fields, resolution_chart
 
 FREQUENCIES = torch.linspace(0.1, 0.5, 41, dtype=torch.float64)
 
@@ -180,9 +178,9 @@ def torn_by_a_vibration():
             np.where((np.arange(120)[:, None] > 100) & (np.arange(80) > 60), 0.4, draw_edge(5.0, 0.5)),
             r"more than one edge: [3-6]\d % of its contrast near 1\d\d px along and [67]\d px across",
         ),
-        (np.clip(draw_edge(5.0, 0.5, levels=(-0.2, 1.2)), 0, 1), "dark side of the edge is clipped: 100 %"),
+        (np.clip(draw_edge(5.0, 0.5, levels=(0.0, 0.9)) + NOISE, 0, 1), "dark side of the edge is clipped: 5. %"),
         (np.clip(draw_edge(5.0, 0.5, levels=(0.1, 1.0)) + NOISE, 0, 1), "bright side .* clipped: 5. %"),
-        ((255 * draw_edge(5.0, 0.5, levels=(0.1, 1.2))).clip(0, 255).astype(np.uint8), "bright side .* exactly 255"),
+        ((255 * (draw_edge(5.0, 0.5, levels=(0.1, 1.2)) + NOISE)).clip(0, 255).astype("u1"), "bright .* exactly 255"),
         (np.where(np.arange(80) == 3, np.nan, draw_edge(5.0, 0.5)), "must be finite, got 120 pixels"),
         (draw_edge(5.0, 0.5)[None], r"one grey image \(h, w\), got shape \(1, 120, 80\)"),
         (np.broadcast_to(np.abs(np.linspace(-20, 20, 41)), (60, 41)), "no edge: both sides"),  # a bar
@@ -204,63 +202,3 @@ def test_tensors_and_arrays_of_numbers():
     curve = measure(draw_edge(5.0, 0.5))
     refuses(lambda: curve.at(1.2), "frequency must be at most 1")
     refuses(lambda: curve.at(torch.tensor([0.2, -0.1])), r"within 0 \.\.\. 1 cycles/px")
-
-
-def test_every_edge_of_the_chart_is_found_and_measures_the_optics():
-    chart = resolution_chart(640, 512, sigma=0.7)
-    edges = rsv.find_slanted_edges(chart)
-    assert len(edges) >= 16
-    truth = gaussian(0.7)
-    for edge in edges:
-        assert abs(edge.angle) == pytest.approx(5.0, abs=0.02)
-        assert edge.contrast == pytest.approx(0.5, abs=0.06)  # 0.62 - 0.12 and 0.74 - 0.20
-        curve = rsv.slanted_edge_mtf(edge.crop(chart))
-        assert curve.angle == pytest.approx(edge.angle, abs=0.02)
-        assert curve.near_vertical == edge.near_vertical
-        assert float(curve.mtf50) == pytest.approx(mtf50_of(truth), rel=1e-3)
-        assert float(curve.at(0.4)) == pytest.approx(truth(0.4), abs=1e-3)
-    kinds = {(edge.near_vertical, edge.angle > 0, edge.bright_side) for edge in edges}
-    assert len(kinds) == 8
-
-
-def test_rotated_and_noisy_chart():
-    turn = -8.0  # degrees
-    chart = rotate(resolution_chart(512, 512).numpy(), turn, reshape=False, order=3, mode="nearest")
-    chart = torch.from_numpy(chart + 0.01 * np.random.default_rng(0).standard_normal(chart.shape).astype(np.float32))
-    longest = [edge for edge in rsv.find_slanted_edges(chart, min_length=45) if edge.contrast < 0.56]
-    expected_angles = {round(abs(turn - 5)), round(abs(turn + 5))}
-    squares = [edge for edge in longest if round(abs(edge.angle)) in expected_angles]
-    assert len(squares) >= 8
-    for edge in squares:
-        curve = rsv.slanted_edge_mtf(edge.crop(chart))
-        assert curve.angle == pytest.approx(edge.angle, abs=0.4)
-        assert 0.26 < float(curve.mtf50) < 0.33  # 0.312 before rotation
-
-
-@pytest.mark.parametrize("turned", [False, True])
-def test_position_polarity_and_scale(turned):
-    image = np.full((150, 200), 400.0)
-    image[20:130, 60:140] = draw_edge(-4.0, 0.7, (110, 80), (400.0, 900.0), (0.0, 0.0))
-    image[20:130, 140:] = image[20:130, 139:140]
-    image = torch.from_numpy(np.ascontiguousarray(image.T if turned else image))
-    (edge,) = [edge for edge in rsv.find_slanted_edges(image) if edge.near_vertical is not turned]
-    assert edge.bright_side == ("bottom" if turned else "right")
-    assert edge.contrast == pytest.approx(500, rel=0.01)
-    assert abs(edge.angle) == pytest.approx(4.0, abs=0.02)
-    begin, size = (edge.left, edge.height) if turned else (edge.top, edge.width)
-    assert begin >= 20
-    assert edge.crop(image).shape == (edge.height, edge.width)
-    assert edge.crop(torch.stack([image, image])).shape == (2, edge.height, edge.width)
-    assert size > 30
-    assert rsv.find_slanted_edges(-image)[0].bright_side == ("top" if turned else "left")
-
-
-def test_no_edge_is_found_in_images_without_edges():
-    assert rsv.find_slanted_edges(city_and_fields(300, 300, seed=3)) == []
-    assert rsv.find_slanted_edges(torch.zeros(100, 100)) == []
-    assert rsv.find_slanted_edges(torch.zeros(8, 100)) == []
-    noise = torch.randn(200, 200, generator=torch.Generator().manual_seed(0))
-    assert rsv.find_slanted_edges(noise) == []
-    upright = torch.zeros(100, 100)
-    upright[:, 50:] = 1.0
-    assert rsv.find_slanted_edges(upright) == []

@@ -20,7 +20,6 @@ from rsvib_torch.report.results import (
     read_vibration,
     write_offsets,
     write_restoration,
-    write_vibration,
 )
 from rsvib_torch.restoration import RestorationVerdict
 from rsvib_torch.results.reason import Reason
@@ -46,7 +45,7 @@ def draw_result() -> DetectionResult:
 
 
 def test_vibration_file_is_plain_json(tmp_path, result):
-    write_vibration(tmp_path / "vibration.json", result, TIMING)
+    replace(result, timing=TIMING).save(tmp_path / "vibration.json")
     text = (tmp_path / "vibration.json").read_text()
     assert "NaN" not in text
     assert "Infinity" not in text
@@ -67,7 +66,7 @@ def test_vibration_file_is_plain_json(tmp_path, result):
     ],
 )
 def test_vibration_of_another_timing_is_refused(tmp_path, result, timing):
-    write_vibration(tmp_path / "vibration.json", result, timing)
+    replace(result, timing=timing).save(tmp_path / "vibration.json")
     read_vibration(tmp_path / "vibration.json", timing)
     with pytest.raises(ValueError, match=r"the vibration was detected with another timing: .*here") as caught:
         read_vibration(tmp_path / "vibration.json", TIMING)
@@ -99,7 +98,7 @@ def test_files_of_other_results_name_their_reader(tmp_path, result):
 )
 def test_malformed_vibration_files_are_refused(tmp_path, result, change, message):
     path = tmp_path / "vibration.json"
-    write_vibration(path, result, TIMING)
+    replace(result, timing=TIMING).save(path)
     data = json.loads(path.read_text())
     change(data)
     path.write_text(json.dumps(data))

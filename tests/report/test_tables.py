@@ -1,8 +1,7 @@
-"""Tables of tones: one row per tone and axis, units in the names, no padding; pandas, xarray and Zarr."""
+"""Tables of tones: one row per tone and axis, units in the names, no padding; pandas."""
 
 import csv
 import math
-import warnings
 
 import numpy as np
 import pytest
@@ -105,21 +104,3 @@ def test_pandas_frame_is_the_table():
     frame = detection_of(TWO_TONES).to_pandas(pixel_size=1e-6)
     assert list(frame.columns) == list(detection_of(TWO_TONES).table(pixel_size=1e-6))
     assert frame.groupby("axis").amplitude_um.max().to_dict() == pytest.approx({"x": 2.0, "y": 1.0})
-
-
-def test_dataset_has_names_units_and_reads_back_from_zarr(tmp_path):
-    xarray = pytest.importorskip("xarray")
-    pytest.importorskip("zarr")
-    found = result_of(TWO_TONES, TIMING, 0.01, last_row=480, reliable=(True, False), reasons=((), ("few",)))
-    dataset = rsv.DetectionResult.stacked([found, found]).to_xarray()
-    assert dataset.amplitude.dims == ("index", "axis", "tone")
-    assert dataset.amplitude.attrs["units"].startswith("px")
-    assert float(dataset.frequency.sel(axis="x", tone=2)[0]) == 145.0
-    assert float(dataset.std_amplitude.sel(axis="y", tone=1)[1]) == 0.01
-    assert dataset.offsets.dims == ("index", "pair", "row", "axis")
-    assert dataset.reasons.sel(axis="y").values.tolist() == ["unspecified"] * 2
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # zarr on metadata that xarray consolidates
-        dataset.to_zarr(tmp_path / "result.zarr")
-    again = xarray.open_zarr(tmp_path / "result.zarr")
-    np.testing.assert_array_equal(again.amplitude, dataset.amplitude)

@@ -246,9 +246,8 @@ def test_run_follows_a_vibration_that_changes_without_an_option(place, tmp_path,
     answer = " ".join(capsys.readouterr().out.split())
     assert f"{FRAMES} frames restored" in answer
     assert "--follow if" not in answer  # the remedy of a steady vibration
-    assert "followed from frame to frame, and removed, by rsvib run" in (tmp_path / "page" / "report.html").read_text(
-        encoding="utf-8"
-    )
+    page = (tmp_path / "page" / "report.html").read_text(encoding="utf-8")
+    assert "followed from frame to frame, and removed, by rsvib run" in page
     manifest = tmp_path / "run" / "manifest.json"
     again = ("restore", place / "frames.npy", tmp_path / "again.npy", *CAMERA, "--vibration", manifest)
     assert "repeat rsvib run" in refused(capsys, *again)

@@ -8,9 +8,9 @@ from scipy.optimize import brentq
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import checks_arguments
-from rsvib_torch.checks.arrays import ArrayLike
+from rsvib_torch.checks.arrays import ArrayLike, as_tensor
 from rsvib_torch.checks.values import check_number
-from rsvib_torch.evaluation.mtf.edge import as_real, check_edge, check_roi, fit_edge, straighten
+from rsvib_torch.evaluation.mtf.edge import check_edge, check_roi, fit_edge, straighten
 from rsvib_torch.evaluation.mtf.spread import Tail, fit_spread
 from rsvib_torch.results.presentation import Result
 from rsvib_torch.text import measured_text
@@ -126,7 +126,7 @@ def slanted_edge_mtf(roi: ArrayLike) -> MtfCurve:
         >>> f"{curve.angle:.2f} degrees, MTF50 {curve.mtf50:.4f}, at Nyquist {curve.at(0.5):.4f}"
         '5.71 degrees, MTF50 0.2354, at Nyquist 0.0438'
     """
-    grey = as_real("roi", roi)
+    grey = as_tensor("roi", roi)
     values = check_roi(grey)
     limits = (0.0, 1.0)
     if not grey.dtype.is_floating_point:
