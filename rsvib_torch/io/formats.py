@@ -7,8 +7,8 @@ from typing import Literal
 
 from rsvib_torch.files.reading import check_regular
 from rsvib_torch.io.array_stores import open_hdf5, open_zarr, write_hdf5, write_zarr
-from rsvib_torch.io.flat_files import check_npy, open_npy, open_raw, write_npy, write_raw
 from rsvib_torch.io.images import check_images, open_images, write_images
+from rsvib_torch.io.numpy_files import check_npy, open_npy, write_npy
 from rsvib_torch.io.stack_info import FFV1, H264, READ_ONLY_VIDEO, FrameReader, StackInfo
 from rsvib_torch.io.tiff import open_tiff, write_tiff
 from rsvib_torch.io.video import VideoReader, check_video, write_video
@@ -31,7 +31,6 @@ class StackFormat:
     check: Callable[[Path, StackInfo], None] | None = None  # raises an error if a stack cannot be written to a path
     kind: Literal["file", "folder", "tree"] = "file"  # a "folder" may contain other files; a "tree" is replaced as one
     marker: str = ""  # file that identifies a folder of any name as a stack of this format
-    companions: tuple[str, ...] = ()  # endings of additional files, which are appended to the file name
     compressions: tuple[str, ...] = ()  # values of ``compression`` besides None
     keeps: tuple[str, ...] = ()  # attributes of ``StackInfo`` that are stored besides the pixels
 
@@ -49,7 +48,6 @@ _FORMATS_OF_THE_PACKAGE = (
     StackFormat(
         "image folder", ("",), open_images, write_images, check=check_images, kind="folder", keeps=_KEPT_BY_PNG
     ),
-    StackFormat("raw", (".raw",), open_raw, write_raw, companions=(".json",), keeps=_KEPT),
     StackFormat(
         "tiff", (".tif", ".tiff"), open_tiff, write_tiff, compressions=("zlib", "lzma"), keeps=(*_KEPT, "metadata")
     ),

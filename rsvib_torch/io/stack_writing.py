@@ -19,10 +19,8 @@ from rsvib_torch.numerics.tables import Array
 
 
 def stack_files(path: PathLike) -> list[Path]:
-    """The paths that a stack occupies: its file or folder, and the files beside it (sidecars)."""
-    path, _ = split_range(Path(path))
-    form = FORMATS.get(path.suffix.lower())
-    return [path, *(path.with_name(path.name + ending) for ending in (() if form is None else form.companions))]
+    """The file or folder of a stack, or of frames of it, for ``check_outputs``."""
+    return [split_range(Path(path))[0]]
 
 
 def check_info_target(
@@ -112,7 +110,7 @@ def write_frames(
 ) -> None:
     """Write a stack from its frames as stored; it gets its name when it is complete and on the disk."""
     assert form.write is not None
-    with whole(path, form.kind, form.companions) as part:
+    with whole(path, form.kind) as part:
         form.write(part, info, frames, compression)
 
 

@@ -155,7 +155,7 @@ def test_images_are_read_as_stored_and_their_orientation_is_kept(tmp_path, endin
     info, read = read_stack_info(tmp_path / "frames"), read_stack(tmp_path / "frames")
     assert info.orientation == 6
     np.testing.assert_allclose(read * 255, frames, atol=9)
-    for output in ("images", "a.mp4", "a.h5", "a.zarr", "a.raw", "a.tif"):
+    for output in ("images", "a.mp4", "a.h5", "a.zarr", "a.tif"):
         write_stack(tmp_path / output, read, dtype="uint8", like=info)
         assert read_stack_info(tmp_path / output).orientation == 6
         assert read_stack(tmp_path / output).shape[-2:] == frames.shape[-2:]
@@ -205,7 +205,7 @@ def test_a_frame_rate_is_kept_by_all_formats(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file.create_dataset("frames", data=FRAMES).attrs["fps"] = 97.0
     like = read_stack_info(tmp_path / "a.h5")
-    for name in ("b.h5", "b.tif", "b.zarr", "b.raw"):
+    for name in ("b.h5", "b.tif", "b.zarr"):
         write_stack(tmp_path / name, torch.rand(6, 20, 30), like=like)
         assert read_stack_info(tmp_path / name).frame_rate == 97.0
     write_stack(tmp_path / "b.mkv", torch.rand(6, 20, 30), dtype="uint8", like=like)

@@ -214,7 +214,6 @@ def test_other_formats_and_sizes_lose_metadata(tmp_path):
     assert set(copied(tmp_path, output="out.npy")) == {*entries, "full scale", "resolution", "orientation"}
     assert set(copied(tmp_path, output="out.h5")) == {*entries}
     assert set(copied(tmp_path, output="folder")) == {*entries}
-    assert set(copied(tmp_path, output="out.raw")) == {*entries}
     assert set(copied(tmp_path, change=lambda frames: frames[:, :32])) == {*GEOREFERENCE}
     assert copied(tmp_path, change=lambda frames: frames[:2]) == ()
 
