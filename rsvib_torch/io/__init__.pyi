@@ -1,5 +1,3 @@
-from .formats import StackFormat as StackFormat
-from .formats import register_format as register_format
 from .frame_times import describe_stack as describe_stack
 from .frame_times import exposure_times as exposure_times
 from .frame_times import stated_rate as stated_rate

@@ -18,7 +18,7 @@ from rsvib_torch.text import quoted
 
 @dataclass(frozen=True)
 class StackFormat:
-    """How stacks are stored in files with certain endings; docs/stacks.md, "Other formats", has the contract."""
+    """How stacks are stored in files with certain endings; docs/architecture.md has the contract."""
 
     name: str  # in messages
     endings: tuple[str, ...]  # lower case with the dot; ``""`` is a name without an ending
@@ -58,23 +58,6 @@ _FORMATS_OF_THE_PACKAGE = (
 )
 FORMATS: dict[str, StackFormat] = {ending: form for form in _FORMATS_OF_THE_PACKAGE for ending in form.endings}
 """Format of every file ending."""
-
-
-def register_format(form: StackFormat) -> None:
-    """Register a format for reading and writing stacks; it replaces earlier formats of the same endings.
-
-    Example:
-        >>> register_format(StackFormat("portable", ("pgm",), open=lambda path: None))
-        Traceback (most recent call last):
-        ...
-        ValueError: endings must be like '.tif', got 'pgm'
-    """
-    if not form.endings:
-        raise ValueError(f"format {form.name!r} has no file ending; expected at least one, like '.tif'")
-    for ending in form.endings:
-        if ending and (not ending.startswith(".") or ending != ending.lower()):
-            raise ValueError(f"endings must be like '.tif', got {ending!r}")
-    FORMATS.update(dict.fromkeys(form.endings, form))
 
 
 def find_format(path: Path) -> StackFormat:

@@ -16,12 +16,10 @@ from test_tiff_pages import check_frames
 import rsvib_torch as rsv
 from rsvib_torch.io import (
     FrameError,
-    StackFormat,
     StackInfo,
     open_stack,
     read_stack,
     read_stack_info,
-    register_format,
     write_stack,
 )
 
@@ -177,11 +175,6 @@ def test_folder_of_float_frames_contains_tiff_files(tmp_path):
     write_stack(tmp_path / "frames", torch.from_numpy(COUNTS / 4095.0))
     assert sorted(file.name for file in (tmp_path / "frames").iterdir()) == [f"frame_000{i}.tif" for i in range(3)]
     np.testing.assert_allclose(read_stack(tmp_path / "frames").numpy(), COUNTS / 4095, rtol=1e-6)
-
-
-@pytest.mark.parametrize(("ending", "message"), [(".TOY", "endings must be like '.tif'"), (None, "has no file ending")])
-def test_format_without_a_valid_ending_is_refused(ending, message):
-    refuses(lambda: register_format(StackFormat("toy", () if ending is None else (ending,), object)), message)
 
 
 @pytest.mark.parametrize(
