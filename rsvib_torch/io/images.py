@@ -21,7 +21,7 @@ from rsvib_torch.files.reading import Table
 from rsvib_torch.io.blocks import BlockReader
 from rsvib_torch.io.full_scale import known_full_scale
 from rsvib_torch.io.stack_info import DIFFERENT, FrameError, StackInfo, Tag, readable_stack
-from rsvib_torch.io.stated_metadata import exif_fields, merged_times
+from rsvib_torch.io.stated_metadata import exif_fields
 from rsvib_torch.io.tiff import open_tiff, storage_of, write_tiff
 from rsvib_torch.numerics.tables import Array
 
@@ -195,7 +195,7 @@ def open_images(path: Path) -> BlockReader:
             message = str(error) if str(error).startswith(str(files[index])) else f"{files[index]}: {error}"
             raise FrameError(message) from error
 
-    return BlockReader(path, replace(stack, frame_numbers=_frame_numbers(files), **merged_times(infos)), read)
+    return BlockReader(path, replace(stack, frame_numbers=_frame_numbers(files)), read)
 
 
 def _ending(info: StackInfo) -> str:

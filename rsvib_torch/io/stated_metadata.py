@@ -10,9 +10,8 @@ import math
 import re
 from collections.abc import Iterable
 from contextlib import suppress
-from datetime import UTC, datetime
 from itertools import pairwise
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
 import numpy as np
@@ -37,11 +36,6 @@ _SECONDS = {
 }
 _TIME_NAME = re.compile(r"(?:frame_?)?(?:time_?stamps?|times?)(?:_(s|sec|ms|us|ns))?", re.IGNORECASE)
 _RATE_NAME = re.compile(r"(?:acquisition_?)?frame_?rate(?:_hz)?|fps", re.IGNORECASE)
-_DESCRIBED_TIME = re.compile(
-    r"(?<!exposure )\b(?:frame_?|elapsed_?)?(?:time_?stamps?|times?)(?:[-_ ](?P<suffix>s|sec|ms|us|ns))?\"?\s*[=:]\s*"
-    r"(?P<value>[-+]?\d+(?:\.\d*)?(?:e[-+]?\d+)?)(?:\s*(?P<unit>s|sec|ms|us|µs|ns)\b)?",
-    re.IGNORECASE,
-)
 
 
 def _time_fields(times: Iterable[float | None], count: int, error: float, source: str) -> Table:
@@ -153,50 +147,16 @@ def info_from_attributes(attributes: Table, shape: tuple[int, ...], dtype: np.dt
     )
 
 
-def _seconds_of_date(text: object, fraction: object = "") -> float | None:
-    """Seconds since 1970 of a date of TIFF and EXIF with a fraction of a second; None without a fraction."""
-    digits = str(fraction).strip("\0 ")
-    date = str(text).strip("\0 ")
-    if "." not in date and digits.isdecimal():
-        date = f"{date}.{digits}"
-    try:
-        moment = datetime.fromisoformat(date[:10].replace(":", "-") + date[10:26])
-    except ValueError:
-        return None
-    return moment.replace(tzinfo=UTC).timestamp() if "." in date else None
-
-
 def exif_fields(data: bytes) -> Table:
-    """Orientation, camera and time of one image from its EXIF metadata."""
+    """Orientation and camera of one image from its EXIF metadata."""
     exif = Image.Exif()
     try:
         exif.load(data)
-        details = exif.get_ifd(ExifTags.IFD.Exif)
     except Exception:  # damaged metadata raise errors of many types
         return {}
     tags = ExifTags.Base
-    taken = _seconds_of_date(details.get(tags.DateTimeOriginal), details.get(tags.SubsecTimeOriginal, ""))
-    changed = _seconds_of_date(exif.get(tags.DateTime), details.get(tags.SubsecTime, ""))
     camera = camera_name(exif.get(tags.Make), exif.get(tags.Model))
-    fields = {"orientation": orientation_of(exif.get(tags.Orientation)), "camera": camera}
-    return fields | _time_fields([changed if taken is None else taken], 1, _SOFTWARE_CLOCK_ERROR, "EXIF times")
-
-
-def merged_times(infos: Iterable[StackInfo | None]) -> Table:
-    """Times of a folder from the times of its files: the ``StackInfo`` of each, None for those that are damaged."""
-    infos = list(infos)
-    times = [info.frame_times[0] if info is not None and info.frame_times else None for info in infos]
-    return _time_fields(times, len(infos), _SOFTWARE_CLOCK_ERROR, infos[0].time_source if infos[0] else "")
-
-
-def _described_time(text: str) -> float | None:
-    """Time in seconds in the description of a page, e.g. ``frame_time_ms = 33.3`` or ``"ElapsedTime-ms": 33.3``."""
-    found = {
-        float(match["value"]) * _SECONDS[unit.lower()]
-        for match in _DESCRIBED_TIME.finditer(text)
-        if (unit := match["suffix"] or match["unit"])
-    }
-    return found.pop() if len(found) == 1 else None
+    return {"orientation": orientation_of(exif.get(tags.Orientation)), "camera": camera}
 
 
 def _ome_fields(text: str, count: int) -> Table:
@@ -220,8 +180,7 @@ def _ome_fields(text: str, count: int) -> Table:
 def tiff_times(tif: tifffile.TiffFile, count: int, metadata: Table) -> Table:
     """Times of ``count`` frames or frame rate of a TIFF file.
 
-    They are stated by the ``metadata`` that this package writes, OME-XML, ImageJ (``finterval``), or on every page by a
-    description with a time and its unit, or by the tag DateTime with a fraction of a second.
+    They are stated by the ``metadata`` that this package writes, OME-XML, or ImageJ (``finterval``).
     """
     if len(metadata.get("frame_times", ())) == count:  # otherwise those of the first of several arrays
         return {"frame_times": tuple(float(time) for time in metadata["frame_times"])}
@@ -234,20 +193,4 @@ def tiff_times(tif: tifffile.TiffFile, count: int, metadata: Table) -> Table:
         interval, unit = imagej.get("finterval"), _SECONDS.get(str(imagej.get("tunit", "s")).lower())
         if isinstance(interval, int | float) and interval > 0:
             return {"frame_rate": 1.0 / (unit * interval), "time_source": "ImageJ finterval"} if unit else {}
-        if len(tif.pages) == count and (first := _page_times(tif.pages.first)):
-            pages = (_page_times(cast("tifffile.TiffPage", tif.pages.get(n, aspage=True))) for n in range(count))
-            source = next(iter(first))
-            return _time_fields((page.get(source) for page in pages), count, _SOFTWARE_CLOCK_ERROR, source)
     return {}
-
-
-def _page_times(page: tifffile.TiffPage) -> dict[str, float]:
-    """The time of a page by each source that states it."""
-    tags = page.tags
-    exif = tags.valueof("ExifTag", {})
-    times = {
-        "times in descriptions": _described_time(page.description),
-        "EXIF times": _seconds_of_date(exif.get("DateTimeOriginal"), exif.get("SubsecTimeOriginal", "")),
-        "DateTime tags": _seconds_of_date(tags.valueof("DateTime"), exif.get("SubsecTime", "")),
-    }
-    return {source: time for source, time in times.items() if time is not None}

@@ -1,7 +1,6 @@
 """Times, frame rate and orientation that other programs store in HDF5, Zarr, TIFF, PNG and JPEG files."""
 
 import warnings
-from datetime import datetime, timedelta
 
 import h5py
 import numpy as np
@@ -109,41 +108,11 @@ def test_times_in_ome_tiff(tmp_path):
     check_dropped_frames(tmp_path / "a.ome.tif")
 
 
-def date_of(time):
-    return f"{datetime(2026, 5, 6, 12, 0, 59, 990_000) + timedelta(seconds=float(time)):%Y:%m:%d %H:%M:%S.%f}"
-
-
-@pytest.mark.parametrize(
-    ("tags", "check"),
-    [
-        (lambda time: {"description": f"gain = 3\nframe_time_ms = {1e3 * time:.3f}\n"}, check_dropped_frames),
-        (lambda time: {"description": f'{{"ElapsedTime-ms": {1e3 * time:.3f}, "Gain": 3}}'}, check_dropped_frames),
-        (lambda time: {"description": f"Time: {1e6 * time:.0f} us, exposure time: 500 us"}, check_dropped_frames),
-        (lambda time: {"extratags": [(306, "s", 0, date_of(time), True)]}, check_dropped_frames),
-        (lambda time: {"description": f"time = {time:.6f}"}, check_no_times),  # no unit
-        (lambda time: {"description": f"exposure_time_ms = {1e3 * time:.3f}"}, check_no_times),
-        (lambda time: {"extratags": [(306, "s", 0, date_of(time).partition(".")[0], True)]}, check_no_times),
-        (lambda _: {"description": "<OME><Image></OME>"}, check_no_times),
-        (lambda time: {"description": f"time_ms = {1e3 * time}, time_ms = 7"}, check_no_times),
-    ],
-)
-def test_times_on_the_pages_of_a_tiff_are_used_unless_they_are_ambiguous(tmp_path, tags, check):
-    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
-        for page, time in zip(FRAMES, TIMES, strict=True):
-            file.write(page, photometric="minisblack", contiguous=False, metadata=None, **tags(time))
-    check(tmp_path / "a.tif")
-    assert read_stack(tmp_path / "a.tif").shape == FRAMES.shape
-
-
-def write_images(folder, ending, frames, orientation, times=None):
+def write_images(folder, ending, frames, orientation):
     folder.mkdir()
     for number, frame in enumerate(frames):
         exif = Image.Exif()
         exif[ExifTags.Base.Orientation] = orientation if np.isscalar(orientation) else orientation[number]
-        if times is not None:
-            details = exif.get_ifd(ExifTags.IFD.Exif)
-            date, fraction = date_of(times[number]).split(".")
-            details[ExifTags.Base.DateTimeOriginal], details[ExifTags.Base.SubsecTimeOriginal] = date, fraction[:3]
         options = {"quality": 98} if ending == "jpg" else {}
         Image.fromarray(frame).save(folder / f"frame{number}.{ending}", exif=exif, **options)
 
@@ -162,12 +131,6 @@ def test_images_are_read_as_stored_and_their_orientation_is_kept(tmp_path, endin
     name = "frame0.tif" if ending == "tif" else "frame_0000.png"  # folders of TIFF files keep their names
     with Image.open(tmp_path / "images" / name) as image:
         assert image.getexif()[ExifTags.Base.Orientation] == 6
-
-
-@pytest.mark.parametrize("ending", ["jpg", "png"])
-def test_exif_times_of_images_find_dropped_frames(tmp_path, ending):
-    write_images(tmp_path / "frames", ending, FRAMES, 1, TIMES)
-    check_dropped_frames(tmp_path / "frames")
 
 
 def test_images_of_different_orientation_are_refused(tmp_path):
