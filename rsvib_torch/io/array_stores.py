@@ -8,7 +8,6 @@ import stat
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
@@ -16,11 +15,10 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from rsvib_torch.checks.values import Value, needed_package
-from rsvib_torch.files.reading import Table
 from rsvib_torch.io.blocks import BlockReader
 from rsvib_torch.io.full_scale import check_dtype
 from rsvib_torch.io.stack_info import StackInfo, readable_stack
-from rsvib_torch.io.stated_metadata import attributes_of, info_from_attributes, time_attributes, times_of_attributes
+from rsvib_torch.io.stated_metadata import attributes_of, info_from_attributes
 from rsvib_torch.numerics.tables import Array
 
 if TYPE_CHECKING:
@@ -110,22 +108,6 @@ def _check_dataset(dataset: Dataset, file_size: int) -> int:
     return chunk
 
 
-def _times_beside(file: File, dataset: Dataset, count: int) -> Table:
-    """Times and frame rate in datasets beside the frames, or in attributes of their group or of the file."""
-    h5py = _h5py()
-    found: Table = {}
-    for group in (file, dataset.parent):
-        found |= time_attributes(group.attrs)
-        for name in time_attributes(dict.fromkeys(group)):
-            member = group[name] if isinstance(group.get(name, getlink=True), h5py.HardLink) else None
-            if not isinstance(member, h5py.Dataset) or _is_outside(member):
-                continue
-            if member.shape in ((), (1,), (count,)) and member.dtype.kind in "iuf":
-                found[name] = member[...]
-                found |= {f"{name}_units": member.attrs[key] for key in ("unit", "units") if key in member.attrs}
-    return times_of_attributes(found, count)
-
-
 def open_hdf5(path: Path) -> BlockReader:
     """Open the dataset of a file that has the shape of a stack."""
     h5py = _h5py()
@@ -134,8 +116,6 @@ def open_hdf5(path: Path) -> BlockReader:
         dataset = _find_dataset(file)
         info = _info(dataset)
         chunk = _check_dataset(dataset, path.stat().st_size)
-        if info.frame_times is None and info.frame_rate is None:
-            info = replace(info, **_times_beside(file, dataset, info.shape[0]))
         # one decoded chunk besides the block; measured with gzip, lzf, shuffle and without compression
         return _reader(path, info, dataset, chunk, opened.pop_all().close)
 

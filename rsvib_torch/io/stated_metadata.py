@@ -6,8 +6,6 @@ or damaged, since frames can be read without them.
 
 from __future__ import annotations
 
-import math
-import re
 from collections.abc import Iterable
 from contextlib import suppress
 from itertools import pairwise
@@ -34,8 +32,6 @@ _SECONDS = {
     **dict.fromkeys(("us", "usec", "µs", "μs", "microsecond", "microseconds"), 1e-6),
     **dict.fromkeys(("ns", "nsec", "nanosecond", "nanoseconds"), 1e-9),
 }
-_TIME_NAME = re.compile(r"(?:frame_?)?(?:time_?stamps?|times?)(?:_(s|sec|ms|us|ns))?", re.IGNORECASE)
-_RATE_NAME = re.compile(r"(?:acquisition_?)?frame_?rate(?:_hz)?|fps", re.IGNORECASE)
 
 
 def _time_fields(times: Iterable[float | None], count: int, error: float, source: str) -> Table:
@@ -58,46 +54,6 @@ def camera_name(make: object, model: object) -> str | None:
     return None if not name else name if repeated else f"{maker} {name}"
 
 
-def time_attributes(attributes: Table) -> Table:
-    """Those attributes whose names are used for times, their unit, and the frame rate."""
-    return {
-        name: value
-        for name, value in attributes.items()
-        if _TIME_NAME.fullmatch(re.sub("_units?$", "", name)) or _RATE_NAME.fullmatch(name)
-    }
-
-
-def times_of_attributes(attributes: Table, count: int) -> Table:
-    """Times of ``count`` frames, and frame rate, of HDF5 and Zarr attributes such as ``timestamps_ms``, ``frame_rate``.
-
-    The unit of times is that of the attribute with ``_unit`` or ``_units`` appended, or the ending of the name;
-    otherwise the one of s, ms, us and ns that gives 1 to 1000 frames per second. Other attributes are ignored.
-    """
-    fields: Table = {}
-    numbers = {name: np.asarray(value).ravel() for name, value in attributes.items()}
-    numbers = {name: stored for name, stored in numbers.items() if stored.dtype.kind in "iuf"}
-    for name, stored in numbers.items():
-        if _RATE_NAME.fullmatch(name) and len(stored) == 1 and 0.0 < float(stored[0]) < math.inf:
-            fields |= {"frame_rate": float(stored[0]), "time_source": f"attribute {name}"}
-    for name, stored in numbers.items():
-        match = _TIME_NAME.fullmatch(name)
-        if match is None or len(stored) != count or count < 2:
-            continue
-        # integers of 64 bits, e.g. nanoseconds since 1970, are subtracted before they are rounded to floats
-        relative = (stored - stored[0]).astype(np.float64) if stored[0] <= stored.min() else np.zeros(count)
-        unit = attributes.get(f"{name}_units", attributes.get(f"{name}_unit", match[1]))
-        if unit is None:
-            interval = float(np.median(np.diff(relative)))
-            factors = [factor for factor in (1.0, 1e-3, 1e-6, 1e-9) if 1e-3 <= factor * interval < 1.0]
-        else:
-            text = unit.decode() if isinstance(unit, bytes) else str(unit)
-            factors = [_SECONDS[text.lower()]] if text.lower() in _SECONDS else []
-        if len(factors) == 1:
-            error = max(factors[0] if stored.dtype.kind in "iu" else 0.0, 1e-9)
-            fields |= _time_fields((factors[0] * relative).tolist(), count, error, f"attribute {name}")
-    return fields
-
-
 def attributes_of(info: StackInfo) -> Table:
     """Attributes of an HDF5 dataset or Zarr array that state ``info``; unknown values are omitted."""
     times, resolution = info.frame_times, info.resolution
@@ -114,7 +70,7 @@ def attributes_of(info: StackInfo) -> Table:
 
 
 def info_from_attributes(attributes: Table, shape: tuple[int, ...], dtype: np.dtype) -> StackInfo:
-    """A stored array as a stack; the attributes are those of ``attributes_of``, or times of other programs."""
+    """A stored array as a stack; the attributes are those of ``attributes_of``."""
     axes = str(attributes.get("axes", {2: "HW", 3: "THW", 4: "TCHW"}.get(len(shape), "")))
     if len(axes) != len(shape) or axes not in ("HW", "THW", "TCHW", "THWC") or min(shape) < 1:
         raise ValueError(f"array of shape {shape} with axes {axes!r}; expected HW, THW, TCHW or THWC")
@@ -127,10 +83,7 @@ def info_from_attributes(attributes: Table, shape: tuple[int, ...], dtype: np.dt
         shape = (1, *shape)
     elif axes == "THWC":
         shape = (shape[0], shape[3], shape[1], shape[2])
-    if attributes.get("frame_times") is not None:
-        stated: Table = {"frame_times": tuple(np.asarray(attributes["frame_times"], dtype=np.float64).ravel().tolist())}
-    else:
-        stated = times_of_attributes(attributes, shape[0])
+    times, rate = (attributes.get(name) for name in ("frame_times", "frame_rate"))
     resolution = attributes.get("resolution")
     if resolution is not None:
         x, y = (float(value) for value in resolution)
@@ -142,8 +95,10 @@ def info_from_attributes(attributes: Table, shape: tuple[int, ...], dtype: np.dt
         known_full_scale(dtype, None if full_scale is None else float(full_scale)),
         resolution=resolution,
         channels_last=axes == "THWC",
+        frame_times=None if times is None else tuple(np.asarray(times, dtype=np.float64).ravel().tolist()),
+        frame_rate=None if rate is None else float(np.asarray(rate).item()),
+        time_source="frame_times" if rate is None else "frame_rate",
         orientation=orientation_of(attributes.get("orientation")),
-        **stated,
     )
 
 
