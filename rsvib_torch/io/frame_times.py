@@ -96,16 +96,12 @@ def _same_rate(spacing: _Spacing, info: StackInfo, timing: SensorTiming) -> bool
 def exposure_times(info: StackInfo, timing: SensorTiming) -> tuple[float, ...] | None:
     """Exposure start of every frame according to its file, in seconds; None if it is not stated, or at another rate.
 
-    If a file without times states that frames are missing, the result consists of multiples of the sensor's frame
-    period. Exact times are returned as they are. Times with an error, e.g. the presentation times of a video, are used
-    only if their interval is the frame period of the sensor to 1 %, or their intervals include it. If they are whole
-    numbers of intervals apart to within their error or 2 % of a period, or a quarter of one with independent
-    deviations, the result consists of multiples of the sensor's frame period, with gaps where frames were dropped.
-    Otherwise the frame rate is variable: the times are
-    returned as they are if their error is less than a tenth of a period.
+    Exact times are returned as they are. Times with an error, e.g. the presentation times of a video, are used only if
+    their interval is the frame period of the sensor to 1 %, or their intervals include it. If they are whole numbers of
+    intervals apart to within their error or 2 % of a period, or a quarter of one with independent deviations, the
+    result consists of multiples of the sensor's frame period, with gaps where frames were dropped. Otherwise the frame
+    rate is variable: the times are returned as they are if their error is less than a tenth of a period.
     """
-    if info.frame_times is None and info.frame_numbers is not None:
-        return tuple(number * timing.frame_period for number in info.frame_numbers)
     if info.frame_times is None or info.time_error == 0.0:
         return info.frame_times
     spacing = _spacing(info)
@@ -175,9 +171,7 @@ def describe_stack(info: StackInfo, timing: SensorTiming | None) -> list[str]:
     if timing is None or timing.frame_start_times is not None:
         return notes
     times, spacing = exposure_times(info, timing), _spacing(info)
-    if info.frame_times is None and info.frame_numbers is not None:
-        missing, source = info.frame_numbers[-1] + 1 - info.shape[0], "the numbers in the file names"
-    elif times is not None and spacing is not None and spacing.numbers is None:
+    if times is not None and spacing is not None and spacing.numbers is None:
         low, high = (1e3 * interval for interval in spacing.limits)
         error = f"whose error is up to {1e3 * info.time_error:.2g} ms; --frame-rate selects equal intervals"
         notes.append(f"{name}: frame intervals of {low:.4g} to {high:.4g} ms; {source} are used, {error}")

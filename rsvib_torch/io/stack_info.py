@@ -63,8 +63,6 @@ class StackInfo(Summarised):
             and EXIF, e.g. 6 for 90 degrees clockwise. Frames always have the stored rows and columns.
         time_error: Largest error of ``frame_times`` in seconds, e.g. rounding in a video; 0 if they are exact exposure
             starts. Times with an error may run at another rate than the exposures (``exposure_times``).
-        frame_numbers: Number of frame intervals from the first frame to each frame, if frames of a recording are
-            missing and the file states this instead of the times.
         time_source: Where the file states times or frame rate, for messages.
         path: The file; None if the stack is not in a file, or has another number of frames than the file.
         metadata: Further metadata of a TIFF file by name, which are kept when it is restored to TIFF; None for those
@@ -95,7 +93,6 @@ class StackInfo(Summarised):
     time_error: float = field(default=0.0, compare=False)
     time_source: str = field(default="frame_times", compare=False)
     path: Path | None = field(default=None, compare=False)
-    frame_numbers: tuple[int, ...] | None = field(default=None, compare=False)
     metadata: Mapping[str, Tag | None] = field(default_factory=dict, compare=False, repr=False)
     decoding_bytes: int = field(default=0, compare=False)
     camera: str | None = field(default=None, compare=False)
@@ -166,7 +163,7 @@ class StackInfo(Summarised):
         if count == self.shape[0]:
             return self
         shape = (count, *self.shape[1:])
-        unknown: Table = dict.fromkeys(("frame_times", "frame_numbers", "path", "files"))
+        unknown: Table = dict.fromkeys(("frame_times", "path", "files"))
         return replace(self, shape=shape, metadata=self.metadata_for(shape), **unknown)
 
     def restored_as(self, scale: int, mosaic: str | None) -> "StackInfo":
