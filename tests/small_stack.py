@@ -55,12 +55,11 @@ def write_small(path, frames=FRAMES):
 
 
 def write_with_gaps(folder, kept, start=0.0):
-    """Write the kept frames of the stack as big-endian counts that state their times and a resolution."""
+    """Write the kept frames of the stack as big-endian counts that state their times."""
     times = [start + index * TIMING.frame_period for index in kept]
-    stated = {"full_scale": 4095, "frame_times": times, "resolution": [120.0, 60.0], "resolution_unit": "centimeter"}
     with h5py.File(folder / "frames.h5", "w") as file:
         file["frames"] = draw_counts(max(kept) + 1)[list(kept)].astype(">u2")
-        file["frames"].attrs.update(stated)
+        file["frames"].attrs.update(full_scale=4095, frame_times=times)
     return times
 
 

@@ -91,8 +91,7 @@ def part_reader(reader: FrameReader, start: int, end: int | None) -> BlockReader
         shape=(last - start, *info.shape[1:]),
         frame_times=None if info.frame_times is None else info.frame_times[start:last],
         files=None if info.files is None else info.files[start:last],
-        path=None,  # the sound of a video, and metadata of all frames, are not those of a part
-        metadata={name: None if tag and tag.scope == "stack" else tag for name, tag in info.metadata.items()},
+        path=None,  # the sound of a video is not that of a part
     )
 
     def read(first: int, _: int) -> Array:

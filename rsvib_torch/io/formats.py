@@ -35,9 +35,8 @@ class StackFormat:
     keeps: tuple[str, ...] = ()  # attributes of ``StackInfo`` that are stored besides the pixels
 
 
-_KEPT = ("full_scale", "frame_times", "orientation", "resolution")
-_KEPT_BY_PNG = ("full_scale", "orientation", "resolution")
-_KEPT_BY_VIDEO = ("full_scale", "frame_times", "orientation")
+_KEPT = ("full_scale", "frame_times", "orientation")
+_KEPT_BY_PNG = ("full_scale", "orientation")
 
 # The order is that of error messages.
 _FORMATS_OF_THE_PACKAGE = (
@@ -51,8 +50,8 @@ _FORMATS_OF_THE_PACKAGE = (
     StackFormat(
         "tiff", (".tif", ".tiff"), open_tiff, write_tiff, compressions=("zlib", "lzma"), keeps=(*_KEPT, "metadata")
     ),
-    StackFormat("FFV1 video", FFV1, VideoReader, write_video, ("uint8", "uint16"), check_video, keeps=_KEPT_BY_VIDEO),
-    StackFormat("H.264 video", H264, VideoReader, write_video, check=check_video, keeps=_KEPT_BY_VIDEO),
+    StackFormat("FFV1 video", FFV1, VideoReader, write_video, ("uint8", "uint16"), check_video, keeps=_KEPT),
+    StackFormat("H.264 video", H264, VideoReader, write_video, check=check_video, keeps=_KEPT),
     StackFormat("avi, webm, mpeg, 3gp and wmv", READ_ONLY_VIDEO, VideoReader),
     StackFormat("zarr", (".zarr",), open_zarr, write_zarr, kind="tree", marker="zarr.json", keeps=_KEPT),
 )

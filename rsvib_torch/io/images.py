@@ -52,11 +52,9 @@ def image_info(path: Path) -> StackInfo:
         if file_size > 4 * nbytes + _LONGEST_HEADER:
             raise ValueError(f"{file_size} bytes are too many for {size}")
         shape = (1, image.height, image.width) if channels == 1 else (1, channels, image.height, image.width)
-        stated, dpi, resolution = image.info.get(_FULL_SCALE), image.info.get("dpi"), None
-        if is_png and dpi is not None and min(dpi) > 0:
-            resolution = (round(dpi[0] / 0.0254) / 100.0, round(dpi[1] / 0.0254) / 100.0, "centimeter")
+        stated = image.info.get(_FULL_SCALE)
         full_scale = known_full_scale(dtype, None if stated is None else float(stated))
-        info = StackInfo(shape, dtype.name, full_scale, resolution=resolution, channels_last=channels > 1)
+        info = StackInfo(shape, dtype.name, full_scale, channels_last=channels > 1)
         return replace(info, **exif_fields(image.info.get("exif", b"")))
 
 
@@ -78,7 +76,7 @@ def decode_image(path: Path) -> Array:
 
 
 def encode_png(path: Path, frame: Array, info: StackInfo) -> None:
-    """Write one frame (H, W) or (C, H, W), with full scale, resolution and orientation in chunks of their own."""
+    """Write one frame (H, W) or (C, H, W), with full scale and orientation in chunks of their own."""
     if frame.ndim == 3:
         frame = np.moveaxis(frame, 0, -1)[..., (2, 1, 0, 3)[: frame.shape[0]] if frame.shape[0] > 1 else (0,)]
     done, encoded = cv2.imencode(".png", np.ascontiguousarray(frame))
@@ -89,10 +87,6 @@ def encode_png(path: Path, frame: Array, info: StackInfo) -> None:
         file.write(data[:_PNG_HEADER])
         if info.full_scale is not None:
             putchunk(file, b"tEXt", f"{_FULL_SCALE}\0{info.full_scale:.17g}".encode())
-        if info.resolution is not None:
-            per_metre = 100.0 if info.resolution[2] == "centimeter" else 100.0 / 2.54
-            sizes = (round(value * per_metre).to_bytes(4, "big") for value in info.resolution[:2])
-            putchunk(file, b"pHYs", *sizes, b"\1")
         if info.orientation != 1:
             exif = Image.Exif()
             exif[ExifTags.Base.Orientation] = info.orientation
@@ -149,7 +143,7 @@ def open_images(path: Path) -> BlockReader:
             continue
         if first is None:
             first = (info, file)
-        if replace(info, resolution=first[0].resolution, frame_times=first[0].frame_times) != first[0]:
+        if replace(info, frame_times=first[0].frame_times) != first[0]:
             kinds = f"{first[1].name} is {first[0].kind}, {file.name} is {info.kind}"
             raise ValueError(f"frames of different size or kind: {kinds}")
     if first is None or len(damaged) > len(files) // 2:
@@ -200,8 +194,7 @@ def _write_file(file: Path, info: StackInfo, frame: Array, source: Path | None =
         if source is not None:
             like, storage = _read_info(source), storage_of(source)
             times = None if like.time_error else like.frame_times
-            one = replace(one, frame_times=times, metadata=like.metadata_for(one.shape, one.dtype))
-            one = replace(one, resolution=like.resolution)
+            one = replace(one, frame_times=times, metadata=like.metadata_for(one.shape))
     write_tiff(file, one, iter([frame]), None, storage)
 
 

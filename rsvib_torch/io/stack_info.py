@@ -11,7 +11,6 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from rsvib_torch.checks.arguments import check_fields, checked_methods
-from rsvib_torch.files.reading import Table
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.results.presentation import Summarised
 from rsvib_torch.text import one_line
@@ -28,7 +27,7 @@ class FrameError(ValueError):
     """One frame of a stack cannot be read; the other frames may be readable."""
 
 
-Scope = Literal["file", "image", "stack"]
+Scope = Literal["file", "image"]
 
 
 @dataclass(frozen=True)
@@ -40,9 +39,7 @@ class Tag:
     count: int  # number of values
     value: Any  # a number, text, bytes, or a tuple of numbers
     first_page: bool  # whether only the first page has it
-    # what it describes: ``"image"``: valid for frames of the same size only (georeferencing); ``"stack"``: for the same
-    # number of them in the same data type only; ``"file"``: for any frames
-    scope: Scope
+    scope: Scope  # for which frames it is valid: of the same size only (``"image"``, georeferencing), or for any
 
 
 @dataclass(frozen=True, repr=False)
@@ -57,7 +54,6 @@ class StackInfo(Summarised):
             floats, whose values are not scaled.
         frame_times: Exposure start of the first row of every frame in seconds, if the file states it.
         frame_rate: Frames per second, if the file states it instead of the times.
-        resolution: Pixels per unit along x and y, and the unit (``"inch"``, ``"centimeter"``), if the file states it.
         channels_last: Whether the file stores the channels of a pixel next to each other.
         orientation: How the stored image is to be turned for display: 1 (as stored) to 8, the values of the tag of TIFF
             and EXIF, e.g. 6 for 90 degrees clockwise. Frames always have the stored rows and columns.
@@ -86,7 +82,6 @@ class StackInfo(Summarised):
     dtype: str
     full_scale: float | None
     frame_times: tuple[float, ...] | None = None
-    resolution: tuple[float, float, str] | None = None
     channels_last: bool = field(default=False, compare=False)
     frame_rate: float | None = None
     orientation: int = 1
@@ -113,7 +108,6 @@ class StackInfo(Summarised):
         parts += [] if self.frame_rate is None else [f"{self.frame_rate:.6g} frames per second"]
         if self.frame_times:
             parts.append(f"frame times {self.frame_times[0]:.6g} … {self.frame_times[-1]:.6g} s")
-        parts += [] if self.resolution is None else ["{:g} x {:g} px per {}".format(*self.resolution)]
         return ", ".join(parts)
 
     @property
@@ -163,8 +157,7 @@ class StackInfo(Summarised):
         if count == self.shape[0]:
             return self
         shape = (count, *self.shape[1:])
-        unknown: Table = dict.fromkeys(("frame_times", "path", "files"))
-        return replace(self, shape=shape, metadata=self.metadata_for(shape), **unknown)
+        return replace(self, shape=shape, frame_times=None, path=None, files=None)
 
     def restored_as(self, scale: int, mosaic: str | None) -> "StackInfo":
         """The kind of stack of the restored frames: ``scale`` times the rows and columns, colours of a mosaic."""
@@ -172,20 +165,13 @@ class StackInfo(Summarised):
             return self
         channels = self.shape[1:-2] if mosaic is None else (3,)
         shape = (self.shape[0], *channels, scale * self.shape[-2], scale * self.shape[-1])
-        resolution = None
-        if self.resolution is not None:
-            x, y, unit = self.resolution
-            resolution = (scale * x, scale * y, unit)
-        return replace(self, shape=shape, path=None, resolution=resolution, metadata=self.metadata_for(shape))
+        return replace(self, shape=shape, path=None, metadata=self.metadata_for(shape))
 
-    def metadata_for(self, shape: tuple[int, ...], dtype: str | None = None) -> dict[str, Tag | None]:
-        """The metadata of a stack of another shape or data type: None for those that are not valid for it."""
-        invalid: set[Scope] = set()
-        if shape != self.shape or dtype not in (None, self.dtype):
-            invalid.add("stack")
-        if shape[-2:] != self.shape[-2:]:
-            invalid.add("image")
-        return {name: None if tag is None or tag.scope in invalid else tag for name, tag in self.metadata.items()}
+    def metadata_for(self, shape: tuple[int, ...]) -> dict[str, Tag | None]:
+        """The metadata of a stack of another shape: None for those that are valid for frames of the same size only."""
+        if shape[-2:] == self.shape[-2:]:
+            return dict(self.metadata)
+        return {name: None if tag is None or tag.scope == "image" else tag for name, tag in self.metadata.items()}
 
     def from_stored(self, frame: Array) -> Array:
         """Convert a frame from the axis order and byte order of the file to (H, W) or (C, H, W) in native order."""

@@ -58,7 +58,7 @@ def _planned(shape: tuple[int, ...], dtype: str | None, full_scale: float | None
     info = StackInfo(tuple(shape), kind.name, full_scale)
     if like is None:
         return info
-    kept, metadata = like.with_frames(shape[0]), like.metadata_for(info.shape, info.dtype)
+    kept, metadata = like.with_frames(shape[0]), like.metadata_for(info.shape)
     exact = replace(kept, frame_times=None if kept.time_error else kept.frame_times, time_error=0.0)
     return replace(exact, shape=info.shape, dtype=info.dtype, full_scale=full_scale, metadata=metadata)
 
@@ -75,18 +75,16 @@ def check_stack_target(
     check_info_target(Path(path), _planned(shape, dtype, full_scale, like))
 
 
-def metadata_not_kept(
-    like: StackInfo, path: PathLike, shape: tuple[int, ...], *, dtype: str | None = None
-) -> tuple[str, ...]:
+def metadata_not_kept(like: StackInfo, path: PathLike, shape: tuple[int, ...]) -> tuple[str, ...]:
     """What a file states about its frames and the file ``path`` with the restored frames will not state.
 
-    ``shape`` is that of the restored frames, ``dtype`` their data type if it is another one. The result has names of
-    tags, ``"full scale"``, ``"resolution"``, ``"orientation"`` and ``"frame times"``.
+    ``shape`` is that of the restored frames. The result has names of tags, ``"full scale"``, ``"orientation"`` and
+    ``"frame times"``.
 
     Example:
-        >>> info = StackInfo((8, 1024, 1024), "uint16", 4095.0, resolution=(300.0, 300.0, "inch"))
+        >>> info = StackInfo((8, 1024, 1024), "uint16", 4095.0, orientation=6)
         >>> metadata_not_kept(info, "restored.npy", (8, 1024, 1024))
-        ('full scale', 'resolution')
+        ('full scale', 'orientation')
         >>> metadata_not_kept(info, "restored.tif", (8, 1024, 1024))
         ()
     """
@@ -96,10 +94,10 @@ def metadata_not_kept(
     keeps = FORMATS[".tif"].keeps if in_files else form.keeps
     stated = like.full_scale not in (None, known_full_scale(np.dtype(like.dtype)))
     timed = like.frame_times is not None and not like.time_error
-    lost = [name for name, tag in like.metadata_for(shape, dtype).items() if tag is None or "metadata" not in keeps]
+    lost = [name for name, tag in like.metadata_for(shape).items() if tag is None or "metadata" not in keeps]
     if in_files and shape[-2:] == like.shape[-2:]:  # otherwise a georeference is lost
         lost = [name for name in lost if not name.endswith(DIFFERENT)]
-    others = {"full_scale": stated, "resolution": like.resolution is not None, "orientation": like.orientation != 1}
+    others = {"full_scale": stated, "orientation": like.orientation != 1}
     lost += [name.replace("_", " ") for name, has in others.items() if has and name not in keeps]
     lost += ["frame times"] * (timed and not ("frame_times" in keeps and shape[0] == like.shape[0]))
     return tuple(lost)

@@ -56,15 +56,13 @@ def camera_name(make: object, model: object) -> str | None:
 
 def attributes_of(info: StackInfo) -> Table:
     """Attributes of an HDF5 dataset or Zarr array that state ``info``; unknown values are omitted."""
-    times, resolution = info.frame_times, info.resolution
+    times = info.frame_times
     stated: Table = {
         "axes": info.stored_axes,
         "full_scale": None if info.full_scale is None else float(info.full_scale),
         "frame_times": None if times is None else [float(time) for time in times],
         "frame_rate": None if times is not None or info.frame_rate is None else float(info.frame_rate),
         "orientation": None if info.orientation == 1 else info.orientation,
-        "resolution": None if resolution is None else [float(value) for value in resolution[:2]],
-        "resolution_unit": None if resolution is None else resolution[2],
     }
     return {name: value for name, value in stated.items() if value is not None}
 
@@ -84,16 +82,11 @@ def info_from_attributes(attributes: Table, shape: tuple[int, ...], dtype: np.dt
     elif axes == "THWC":
         shape = (shape[0], shape[3], shape[1], shape[2])
     times, rate = (attributes.get(name) for name in ("frame_times", "frame_rate"))
-    resolution = attributes.get("resolution")
-    if resolution is not None:
-        x, y = (float(value) for value in resolution)
-        resolution = (x, y, str(attributes.get("resolution_unit", "centimeter")))
     full_scale = attributes.get("full_scale")
     return StackInfo(
         shape,
         dtype.name,
         known_full_scale(dtype, None if full_scale is None else float(full_scale)),
-        resolution=resolution,
         channels_last=axes == "THWC",
         frame_times=None if times is None else tuple(np.asarray(times, dtype=np.float64).ravel().tolist()),
         frame_rate=None if rate is None else float(np.asarray(rate).item()),

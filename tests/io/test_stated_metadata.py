@@ -27,12 +27,6 @@ def check_dropped_frames(path):
     assert used == pytest.approx(TIMES, rel=1e-9)
 
 
-def test_pixels_of_a_finer_grid_are_smaller():
-    info = rsv.StackInfo((4, 8, 6), "uint8", 255.0, resolution=(300.0, 150.0, "inch"))
-    assert info.restored_as(2, None).resolution == (600.0, 300.0, "inch")
-    assert info.restored_as(1, "RGGB").resolution == info.resolution
-
-
 def test_frame_rate_in_hdf5_is_compared(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["frames"] = FRAMES
