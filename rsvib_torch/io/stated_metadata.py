@@ -1,16 +1,4 @@
-"""What attributes of this package and metadata of other programs (HDF5, Zarr, TIFF, EXIF) state about a stack.
-
-Functions for other programs return the fields of ``StackInfo`` that the metadata state, and none if they are ambiguous
-or damaged, since frames can be read without them.
-"""
-
-from __future__ import annotations
-
-from collections.abc import Iterable
-from contextlib import suppress
-from itertools import pairwise
-from typing import TYPE_CHECKING
-from xml.etree import ElementTree
+"""What the attributes of HDF5 and Zarr arrays and EXIF metadata state about a stack."""
 
 import numpy as np
 from PIL import ExifTags, Image
@@ -20,26 +8,6 @@ from rsvib_torch.files.reading import Table
 from rsvib_torch.io.full_scale import known_full_scale
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.text import one_line
-
-if TYPE_CHECKING:
-    import tifffile
-
-_SOFTWARE_CLOCK_ERROR = 5e-3  # s; times that acquisition software writes have jitter of milliseconds
-
-_SECONDS = {
-    **dict.fromkeys(("s", "sec", "second", "seconds"), 1.0),
-    **dict.fromkeys(("ms", "msec", "millisecond", "milliseconds"), 1e-3),
-    **dict.fromkeys(("us", "usec", "µs", "μs", "microsecond", "microseconds"), 1e-6),
-    **dict.fromkeys(("ns", "nsec", "nanosecond", "nanoseconds"), 1e-9),
-}
-
-
-def _time_fields(times: Iterable[float | None], count: int, error: float, source: str) -> Table:
-    """Fields of ``count`` times in seconds; none unless all are known and strictly increasing."""
-    known = [time for time in times if time is not None and np.isfinite(time)]
-    if len(known) != count or any(later <= earlier for earlier, later in pairwise(known)):
-        return {}
-    return {"frame_times": tuple(known), "time_error": error, "time_source": source}
 
 
 def orientation_of(value: object) -> int:
@@ -105,40 +73,3 @@ def exif_fields(data: bytes) -> Table:
     tags = ExifTags.Base
     camera = camera_name(exif.get(tags.Make), exif.get(tags.Model))
     return {"orientation": orientation_of(exif.get(tags.Orientation)), "camera": camera}
-
-
-def _ome_fields(text: str, count: int) -> Table:
-    """Times of the planes (``DeltaT``) or their interval (``TimeIncrement``) in the OME-XML of an image."""
-    pixels = ElementTree.fromstring(text).find(".//{*}Pixels")
-    if pixels is None:
-        return {}
-    times: dict[int, float] = {}
-    for plane in pixels.iterfind("{*}Plane"):
-        unit = _SECONDS.get(plane.get("DeltaTUnit", "s").lower())
-        if plane.get("TheC", "0") == "0" and plane.get("DeltaT") is not None and unit is not None:
-            number = int(plane.get("TheT", "0")) + int(plane.get("TheZ", "0"))  # only one of them varies
-            times[number] = unit * float(plane.get("DeltaT", ""))
-    fields = _time_fields((times.get(i) for i in range(count)), count, _SOFTWARE_CLOCK_ERROR, "OME DeltaT")
-    interval = float(pixels.get("TimeIncrement", "0")) * _SECONDS.get(pixels.get("TimeIncrementUnit", "s").lower(), 0.0)
-    if not fields and interval > 0.0:
-        fields = {"frame_rate": 1.0 / interval, "time_source": "OME TimeIncrement"}
-    return fields
-
-
-def tiff_times(tif: tifffile.TiffFile, count: int, metadata: Table) -> Table:
-    """Times of ``count`` frames or frame rate of a TIFF file.
-
-    They are stated by the ``metadata`` that this package writes, OME-XML, or ImageJ (``finterval``).
-    """
-    if len(metadata.get("frame_times", ())) == count:  # otherwise those of the first of several arrays
-        return {"frame_times": tuple(float(time) for time in metadata["frame_times"])}
-    if "frame_rate" in metadata:
-        return {"frame_rate": float(metadata["frame_rate"]), "time_source": "frame_rate"}
-    with suppress(Exception):  # damaged metadata raise errors of many types
-        if tif.ome_metadata:
-            return _ome_fields(tif.ome_metadata, count)
-        imagej = tif.imagej_metadata or {}
-        interval, unit = imagej.get("finterval"), _SECONDS.get(str(imagej.get("tunit", "s")).lower())
-        if isinstance(interval, int | float) and interval > 0:
-            return {"frame_rate": 1.0 / (unit * interval), "time_source": "ImageJ finterval"} if unit else {}
-    return {}

@@ -20,7 +20,7 @@ from rsvib_torch.files.reading import Table
 from rsvib_torch.io.blocks import BlockReader, contiguous_reader
 from rsvib_torch.io.full_scale import check_dtype, known_full_scale
 from rsvib_torch.io.stack_info import FrameError, Scope, StackInfo, Tag, readable_stack
-from rsvib_torch.io.stated_metadata import attributes_of, orientation_of, tiff_times
+from rsvib_torch.io.stated_metadata import attributes_of, orientation_of
 from rsvib_torch.numerics.tables import Array
 
 _PHOTOMETRIC: tuple[int, ...] = (tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.RGB)
@@ -116,14 +116,18 @@ def _info(
     full_scale = metadata.get("full_scale")
     if full_scale is None and isinstance(bits, int) and bits not in (8, 16, 32, 64) and dtype.kind == "u":
         full_scale = 2**bits - 1  # packed pixels, e.g. 4095 for 12 bits
+    times = metadata.get("frame_times", ())
     return StackInfo(
         shape,
         dtype.name,
         known_full_scale(dtype, None if full_scale is None else float(full_scale)),
         channels_last=channels_last,
         orientation=orientation_of(tif.pages.first.tags.valueof("Orientation")),
+        # those of another number of frames are of the first of several arrays
+        frame_times=tuple(float(time) for time in times) if len(times) == shape[0] else None,
+        frame_rate=float(metadata["frame_rate"]) if "frame_rate" in metadata else None,
+        time_source="frame_rate" if "frame_rate" in metadata else "frame_times",
         metadata=_metadata(tif),
-        **tiff_times(tif, shape[0], metadata),
     )
 
 

@@ -5,7 +5,6 @@ import warnings
 import h5py
 import numpy as np
 import pytest
-import tifffile
 import torch
 import zarr
 from PIL import ExifTags, Image
@@ -40,27 +39,6 @@ def test_times_in_zarr_attributes(tmp_path):
     attributes = {"frame_times": TIMES.tolist(), "orientation": "portrait"}
     zarr.create_array(store=str(tmp_path / "a.zarr"), data=FRAMES, attributes=attributes)
     check_dropped_frames(tmp_path / "a.zarr")
-
-
-@pytest.mark.parametrize(
-    "metadata",
-    [
-        {"imagej": True, "metadata": {"axes": "TYX", "finterval": 1 / 30, "fps": 96.154}},
-        {"imagej": True, "metadata": {"axes": "TYX", "finterval": 100 / 3, "tunit": "ms"}},
-        {"ome": True, "metadata": {"axes": "TYX", "TimeIncrement": 1 / 30, "TimeIncrementUnit": "s"}},
-    ],
-)
-def test_frame_rate_in_tiff_is_compared(tmp_path, metadata):
-    tifffile.imwrite(tmp_path / "a.tif", FRAMES, photometric="minisblack", **metadata)
-    with pytest.warns(rsv.TimingWarning, match=r"a\.tif: 30 frames per second according to its (ImageJ|OME)"):
-        timing_from_first_frame(TIMING, read_stack_info(tmp_path / "a.tif"))
-
-
-def test_times_in_ome_tiff(tmp_path):
-    plane = {"DeltaT": (1e3 * TIMES).tolist(), "DeltaTUnit": ["ms"] * 6}
-    metadata = {"axes": "TYX", "Plane": plane}
-    tifffile.imwrite(tmp_path / "a.ome.tif", FRAMES, photometric="minisblack", metadata=metadata)
-    check_dropped_frames(tmp_path / "a.ome.tif")
 
 
 def write_images(folder, ending, frames, orientation):
