@@ -7,9 +7,11 @@ from typing import Literal
 
 from rsvib_torch.files.reading import check_regular
 from rsvib_torch.io.array_stores import open_hdf5, open_zarr, write_hdf5, write_zarr
+from rsvib_torch.io.frame_reader import FrameReader
 from rsvib_torch.io.images import check_images, open_images, write_images
-from rsvib_torch.io.numpy_files import check_npy, open_npy, write_npy
-from rsvib_torch.io.stack_info import FFV1, H264, READ_ONLY_VIDEO, FrameReader, StackInfo
+from rsvib_torch.io.numpy_files import open_npy, write_npy
+from rsvib_torch.io.stack_info import FFV1, H264, READ_ONLY_VIDEO, StackInfo
+from rsvib_torch.io.stated_metadata import check_array
 from rsvib_torch.io.tiff import open_tiff, write_tiff
 from rsvib_torch.io.video import VideoReader, check_video, write_video
 from rsvib_torch.numerics.tables import Array
@@ -40,8 +42,8 @@ _KEPT_BY_PNG = ("full_scale", "orientation")
 
 # The order is that of error messages.
 _FORMATS_OF_THE_PACKAGE = (
-    StackFormat("npy", (".npy",), open_npy, write_npy, check=check_npy),
-    StackFormat("hdf5", (".h5", ".hdf5", ".hdf"), open_hdf5, write_hdf5, keeps=_KEPT),
+    StackFormat("npy", (".npy",), open_npy, write_npy, check=check_array),
+    StackFormat("hdf5", (".h5", ".hdf5", ".hdf"), open_hdf5, write_hdf5, check=check_array, keeps=_KEPT),
     StackFormat("jpeg", (".jpg", ".jpeg"), open_images),
     StackFormat("png", (".png",), open_images, write_images, ("uint8", "uint16"), check_images, keeps=_KEPT_BY_PNG),
     StackFormat(
@@ -53,7 +55,9 @@ _FORMATS_OF_THE_PACKAGE = (
     StackFormat("FFV1 video", FFV1, VideoReader, write_video, ("uint8", "uint16"), check_video, keeps=_KEPT),
     StackFormat("H.264 video", H264, VideoReader, write_video, check=check_video, keeps=_KEPT),
     StackFormat("avi, webm, mpeg, 3gp and wmv", READ_ONLY_VIDEO, VideoReader),
-    StackFormat("zarr", (".zarr",), open_zarr, write_zarr, kind="tree", marker="zarr.json", keeps=_KEPT),
+    StackFormat(
+        "zarr", (".zarr",), open_zarr, write_zarr, check=check_array, kind="tree", marker="zarr.json", keeps=_KEPT
+    ),
 )
 FORMATS: dict[str, StackFormat] = {ending: form for form in _FORMATS_OF_THE_PACKAGE for ending in form.endings}
 """Format of every file ending."""

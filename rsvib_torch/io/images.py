@@ -18,9 +18,9 @@ from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile, putchunk
 
 from rsvib_torch.files.reading import Table
-from rsvib_torch.io.blocks import BlockReader
+from rsvib_torch.io.frame_reader import FrameError, FrameReader, readable_stack
 from rsvib_torch.io.full_scale import known_full_scale
-from rsvib_torch.io.stack_info import DIFFERENT, FrameError, StackInfo, Tag, readable_stack
+from rsvib_torch.io.stack_info import DIFFERENT, StackInfo, Tag
 from rsvib_torch.io.stated_metadata import exif_fields
 from rsvib_torch.io.tiff import open_tiff, storage_of, write_tiff
 from rsvib_torch.numerics.tables import Array
@@ -54,7 +54,7 @@ def image_info(path: Path) -> StackInfo:
         shape = (1, image.height, image.width) if channels == 1 else (1, channels, image.height, image.width)
         stated = image.info.get(_FULL_SCALE)
         full_scale = known_full_scale(dtype, None if stated is None else float(stated))
-        info = StackInfo(shape, dtype.name, full_scale, channels_last=channels > 1)
+        info = StackInfo(shape, dtype.name, full_scale)
         return replace(info, **exif_fields(image.info.get("exif", b"")))
 
 
@@ -129,7 +129,7 @@ def _read_info(file: Path) -> StackInfo:
     return reader.info
 
 
-def open_images(path: Path) -> BlockReader:
+def open_images(path: Path) -> FrameReader:
     """Open the files of a folder, or one file; frames are decoded on access."""
     files = _frame_files(path)
     damaged: dict[int, ValueError] = {}
@@ -169,7 +169,7 @@ def open_images(path: Path) -> BlockReader:
             message = str(error) if str(error).startswith(str(files[index])) else f"{files[index]}: {error}"
             raise FrameError(message) from error
 
-    return BlockReader(path, stack, read)
+    return FrameReader(path, stack, read)
 
 
 def _ending(info: StackInfo) -> str:

@@ -1,19 +1,17 @@
-"""What a file states about a stack: shape, data type, full scale, times, orientation; errors of unreadable files."""
+"""What a file states about a stack: shape, data type, full scale, times, orientation."""
 
 import math
 import re
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 
 from rsvib_torch.checks.arguments import check_fields, checked_methods
-from rsvib_torch.numerics.tables import Array
 from rsvib_torch.results.presentation import Summarised
-from rsvib_torch.text import one_line
 
 # Endings of videos: of those that are written with H.264 and FFV1, and of those that are only read.
 H264, FFV1 = (".mp4", ".mov", ".m4v"), (".mkv",)
@@ -21,10 +19,6 @@ READ_ONLY_VIDEO = (".avi", ".webm", ".3gp", ".mts", ".m2ts", ".ts", ".mpg", ".mp
 VIDEO = (*FFV1, *H264, *READ_ONLY_VIDEO)
 
 DIFFERENT = " (differs between files)"  # ending of the names of metadata of a folder
-
-
-class FrameError(ValueError):
-    """One frame of a stack cannot be read; the other frames may be readable."""
 
 
 Scope = Literal["file", "image"]
@@ -54,12 +48,10 @@ class StackInfo(Summarised):
             floats, whose values are not scaled.
         frame_times: Exposure start of the first row of every frame in seconds, if the file states it.
         frame_rate: Frames per second, if the file states it instead of the times.
-        channels_last: Whether the file stores the channels of a pixel next to each other.
         orientation: How the stored image is to be turned for display: 1 (as stored) to 8, the values of the tag of TIFF
             and EXIF, e.g. 6 for 90 degrees clockwise. Frames always have the stored rows and columns.
         time_error: Largest error of ``frame_times`` in seconds, e.g. rounding in a video; 0 if they are exact exposure
             starts. Times with an error may run at another rate than the exposures (``exposure_times``).
-        time_source: Where the file states times or frame rate, for messages.
         path: The file; None if the stack is not in a file, or has another number of frames than the file.
         metadata: Further metadata of a TIFF file by name, which are kept when it is restored to TIFF; None for those
             that cannot be kept.
@@ -82,11 +74,9 @@ class StackInfo(Summarised):
     dtype: str
     full_scale: float | None
     frame_times: tuple[float, ...] | None = None
-    channels_last: bool = field(default=False, compare=False)
     frame_rate: float | None = None
     orientation: int = 1
     time_error: float = field(default=0.0, compare=False)
-    time_source: str = field(default="frame_times", compare=False)
     path: Path | None = field(default=None, compare=False)
     metadata: Mapping[str, Tag | None] = field(default_factory=dict, compare=False, repr=False)
     decoding_bytes: int = field(default=0, compare=False)
@@ -121,19 +111,14 @@ class StackInfo(Summarised):
         return value if fits else None
 
     @property
+    def time_source(self) -> str:
+        """Where the file states times or frame rate, for messages."""
+        return "time stamps" if self.time_error else "frame_rate" if self.frame_times is None else "frame_times"
+
+    @property
     def axes(self) -> str:
         """``"THW"`` (grey) or ``"TCHW"``."""
         return "THW" if len(self.shape) == 3 else "TCHW"
-
-    @property
-    def stored_axes(self) -> str:
-        """Axes in the order of the file: ``"THW"``, ``"TCHW"`` or ``"THWC"``."""
-        return "THWC" if self.axes == "TCHW" and self.channels_last else self.axes
-
-    @property
-    def stored_shape(self) -> tuple[int, ...]:
-        """Shape in the order of the file."""
-        return tuple(self.shape[self.axes.index(axis)] for axis in self.stored_axes)
 
     @property
     def kind(self) -> str:
@@ -173,30 +158,6 @@ class StackInfo(Summarised):
             return dict(self.metadata)
         return {name: None if tag is None or tag.scope == "image" else tag for name, tag in self.metadata.items()}
 
-    def from_stored(self, frame: Array) -> Array:
-        """Convert a frame from the axis order and byte order of the file to (H, W) or (C, H, W) in native order."""
-        if self.stored_axes == "THWC":
-            frame = np.moveaxis(frame, -1, 0)
-        return frame.astype(frame.dtype.newbyteorder("="), copy=False)
-
-    def to_stored(self, frame: Array) -> Array:
-        """Convert a frame (H, W) or (C, H, W) to the axis order and data type of the file."""
-        if self.stored_axes == "THWC":
-            frame = np.moveaxis(frame, 0, -1)
-        return np.ascontiguousarray(frame, dtype=self.dtype)
-
-
-class FrameReader(Protocol):
-    """An open stack; frames are read one at a time, in any order."""
-
-    info: StackInfo
-
-    def frame(self, index: int) -> Array:
-        """Pixels of a frame as stored: (H, W) or (C, H, W), in ``info.dtype``; ``FrameError`` if it is damaged."""
-
-    def close(self) -> None:
-        """Close the file, if it is open between frames."""
-
 
 _RANGE = re.compile(r"(.+)\[(\d*):(\d*)\]")
 
@@ -213,27 +174,3 @@ def split_range(path: Path) -> tuple[Path, tuple[int, int | None] | None]:
 def is_video(path: Path) -> bool:
     """Whether a stack, or frames of it, is a video by its name."""
     return split_range(path)[0].suffix.lower() in VIDEO
-
-
-@contextmanager
-def readable_stack(path: Path, kind: str) -> Iterator[None]:
-    """Convert any exception of a decoder of a ``kind`` of files into a ``ValueError``, except a missing permission."""
-    if not path.is_dir():
-        path.open("rb").close()
-    try:
-        yield
-    except MemoryError:
-        raise
-    except Exception as error:
-        raise ValueError(f"{path}: not a readable {kind} stack: {one_line(error)}") from error
-
-
-@contextmanager
-def readable_frame(path: Path, index: int) -> Iterator[None]:
-    """Convert any exception of a decoder into a one-line ``FrameError`` of frame ``index``."""
-    try:
-        yield
-    except (MemoryError, FrameError, FileNotFoundError):
-        raise
-    except Exception as error:
-        raise FrameError(f"{path}: frame {index} cannot be read: {one_line(error)}") from error

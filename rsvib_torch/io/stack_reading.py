@@ -16,11 +16,11 @@ from rsvib_torch.checks.arrays import PathLike
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.files.free_memory import check_fits
 from rsvib_torch.frames.loading import LoadedFrames
-from rsvib_torch.io.blocks import part_reader
 from rsvib_torch.io.formats import find_format
+from rsvib_torch.io.frame_reader import FrameReader, part_reader
 from rsvib_torch.io.frame_times import timing_from_first_frame
 from rsvib_torch.io.full_scale import counts_to_frames, full_scale_of_counts
-from rsvib_torch.io.stack_info import FrameReader, StackInfo, split_range
+from rsvib_torch.io.stack_info import StackInfo, split_range
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array
 

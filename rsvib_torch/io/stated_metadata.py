@@ -1,11 +1,13 @@
-"""What the attributes of HDF5 and Zarr arrays and EXIF metadata state about a stack."""
+"""What attributes of arrays, descriptions of TIFF files, and EXIF metadata state about a stack."""
+
+from pathlib import Path
 
 import numpy as np
 from PIL import ExifTags, Image
 
 from rsvib_torch.checks.arrays import channels_appear_last
 from rsvib_torch.files.reading import Table
-from rsvib_torch.io.full_scale import known_full_scale
+from rsvib_torch.io.full_scale import check_dtype, known_full_scale
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.text import one_line
 
@@ -23,10 +25,9 @@ def camera_name(make: object, model: object) -> str | None:
 
 
 def attributes_of(info: StackInfo) -> Table:
-    """Attributes of an HDF5 dataset or Zarr array that state ``info``; unknown values are omitted."""
+    """Attributes of an array in a file, or keys of a TIFF description, that state ``info``, without unknown values."""
     times = info.frame_times
     stated: Table = {
-        "axes": info.stored_axes,
         "full_scale": None if info.full_scale is None else float(info.full_scale),
         "frame_times": None if times is None else [float(time) for time in times],
         "frame_rate": None if times is not None or info.frame_rate is None else float(info.frame_rate),
@@ -35,32 +36,33 @@ def attributes_of(info: StackInfo) -> Table:
     return {name: value for name, value in stated.items() if value is not None}
 
 
-def info_from_attributes(attributes: Table, shape: tuple[int, ...], dtype: np.dtype) -> StackInfo:
-    """A stored array as a stack; the attributes are those of ``attributes_of``."""
-    axes = str(attributes.get("axes", {2: "HW", 3: "THW", 4: "TCHW"}.get(len(shape), "")))
-    if len(axes) != len(shape) or axes not in ("HW", "THW", "TCHW", "THWC") or min(shape) < 1:
-        raise ValueError(f"array of shape {shape} with axes {axes!r}; expected HW, THW, TCHW or THWC")
-    if "axes" not in attributes and channels_appear_last(shape):
-        raise ValueError(
-            f"array of shape {shape} appears to have its channels last; store (T, C, H, W), or (T, H, W, C) with the "
-            "attribute axes='THWC'"
-        )
-    if axes == "HW":
-        shape = (1, *shape)
-    elif axes == "THWC":
-        shape = (shape[0], shape[3], shape[1], shape[2])
-    times, rate = (attributes.get(name) for name in ("frame_times", "frame_rate"))
-    full_scale = attributes.get("full_scale")
-    return StackInfo(
-        shape,
-        dtype.name,
-        known_full_scale(dtype, None if full_scale is None else float(full_scale)),
-        channels_last=axes == "THWC",
-        frame_times=None if times is None else tuple(np.asarray(times, dtype=np.float64).ravel().tolist()),
-        frame_rate=None if rate is None else float(np.asarray(rate).item()),
-        time_source="frame_times" if rate is None else "frame_rate",
-        orientation=orientation_of(attributes.get("orientation")),
-    )
+def fields_of_attributes(attributes: Table, count: int, dtype: np.dtype) -> Table:
+    """Fields of ``StackInfo`` of ``count`` frames that the attributes state, as ``attributes_of`` writes them."""
+    full_scale, rate = (attributes.get(name) for name in ("full_scale", "frame_rate"))
+    times = np.asarray(attributes.get("frame_times", ()), dtype=np.float64).ravel().tolist()
+    return {
+        "full_scale": known_full_scale(dtype, None if full_scale is None else float(full_scale)),
+        "frame_times": tuple(times) if len(times) == count else None,
+        "frame_rate": None if rate is None else float(np.asarray(rate).item()),
+        "orientation": orientation_of(attributes.get("orientation")),
+    }
+
+
+def info_of_array(shape: tuple[int, ...], dtype: np.dtype, attributes: Table | None = None) -> StackInfo:
+    """An array (H, W), (T, H, W) or (T, C, H, W) in a file as a stack."""
+    check_dtype(dtype)
+    if len(shape) not in (2, 3, 4) or min(shape) < 1:
+        raise ValueError(f"array of shape {shape}; expected (H, W), (T, H, W) or (T, C, H, W)")
+    if channels_appear_last(shape):
+        raise ValueError(f"array of shape {shape} appears to have its channels last; store (T, C, H, W)")
+    stack = shape if len(shape) > 2 else (1, *shape)
+    return StackInfo(stack, dtype.name, **fields_of_attributes(attributes or {}, stack[0], dtype))
+
+
+def check_array(path: Path, info: StackInfo) -> None:
+    """Refuse a shape that would be read as another one."""
+    if channels_appear_last(info.shape):
+        raise ValueError(f"{path}: array of shape {info.shape} would be read as one with channels last; write .tif")
 
 
 def exif_fields(data: bytes) -> Table:

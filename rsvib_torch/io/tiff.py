@@ -17,10 +17,10 @@ import numpy as np
 import tifffile
 
 from rsvib_torch.files.reading import Table
-from rsvib_torch.io.blocks import BlockReader, contiguous_reader
-from rsvib_torch.io.full_scale import check_dtype, known_full_scale
-from rsvib_torch.io.stack_info import FrameError, Scope, StackInfo, Tag, readable_stack
-from rsvib_torch.io.stated_metadata import attributes_of, orientation_of
+from rsvib_torch.io.frame_reader import FrameError, FrameReader, contiguous_reader, readable_stack
+from rsvib_torch.io.full_scale import check_dtype
+from rsvib_torch.io.stack_info import Scope, StackInfo, Tag
+from rsvib_torch.io.stated_metadata import attributes_of, fields_of_attributes
 from rsvib_torch.numerics.tables import Array
 
 _PHOTOMETRIC: tuple[int, ...] = (tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.RGB)
@@ -105,33 +105,19 @@ def _series(tif: tifffile.TiffFile, count: int) -> tifffile.TiffPageSeries | Non
     return None
 
 
-def _info(
-    tif: tifffile.TiffFile, shape: tuple[int, ...], dtype: np.dtype, photometric: object, *, channels_last: bool
-) -> StackInfo:
+def _info(tif: tifffile.TiffFile, shape: tuple[int, ...], dtype: np.dtype, photometric: object) -> StackInfo:
     """A stack of that shape, with what the first page states."""
     if photometric not in _PHOTOMETRIC:
         raise ValueError(f"pixels are {_name(photometric)}; expected grey (black is 0) or RGB")
     check_dtype(dtype)
     metadata, bits = _json_description(tif), tif.pages.first.bitspersample
-    full_scale = metadata.get("full_scale")
-    if full_scale is None and isinstance(bits, int) and bits not in (8, 16, 32, 64) and dtype.kind == "u":
-        full_scale = 2**bits - 1  # packed pixels, e.g. 4095 for 12 bits
-    times = metadata.get("frame_times", ())
-    return StackInfo(
-        shape,
-        dtype.name,
-        known_full_scale(dtype, None if full_scale is None else float(full_scale)),
-        channels_last=channels_last,
-        orientation=orientation_of(tif.pages.first.tags.valueof("Orientation")),
-        # those of another number of frames are of the first of several arrays
-        frame_times=tuple(float(time) for time in times) if len(times) == shape[0] else None,
-        frame_rate=float(metadata["frame_rate"]) if "frame_rate" in metadata else None,
-        time_source="frame_rate" if "frame_rate" in metadata else "frame_times",
-        metadata=_metadata(tif),
-    )
+    if isinstance(bits, int) and bits not in (8, 16, 32, 64) and dtype.kind == "u":
+        metadata = {"full_scale": 2**bits - 1, **metadata}  # packed pixels, e.g. 4095 for 12 bits
+    metadata["orientation"] = tif.pages.first.tags.valueof("Orientation")
+    return StackInfo(shape, dtype.name, metadata=_metadata(tif), **fields_of_attributes(metadata, shape[0], dtype))
 
 
-def open_tiff(path: Path) -> BlockReader:
+def open_tiff(path: Path) -> FrameReader:
     """Open a TIFF file of one or many pages."""
     with readable_stack(path, "TIFF"), ExitStack() as opened:
         tif = opened.enter_context(tifffile.TiffFile(path))
@@ -161,12 +147,13 @@ def open_tiff(path: Path) -> BlockReader:
             raise ValueError(f"axes {axes} of sizes {shape}; expected an axis of frames, one of channels, and YX")
         stack = shape if order["time"] else (1, *shape)
         stack = (stack[0], stack[3], *stack[1:3]) if order["last"] else stack
-        info = _info(tif, stack, dtype, first.photometric, channels_last=order["last"] is not None)
+        info, channels_last = _info(tif, stack, dtype, first.photometric), order["last"] is not None
         if series is None and len(numbers) < len(headers):
             info = replace(info, metadata={**info.metadata, "thumbnails and masks": None})
         # 3. Its frames: one after another, or in one or several pages.
         if offset is not None:
-            return contiguous_reader(path, info, offset, dtype.newbyteorder(tif.byteorder))
+            stored_dtype = dtype.newbyteorder(tif.byteorder)
+            return contiguous_reader(path, info, offset, stored_dtype, channels_last=channels_last)
         nbytes = info.shape[0] * info.frame_bytes
         if nbytes > _LARGEST_RATIO * size:
             raise ValueError(f"its header states {nbytes} bytes of pixels, which {size} bytes cannot hold")
@@ -182,9 +169,9 @@ def open_tiff(path: Path) -> BlockReader:
             if not all(_is_complete(page, size) for page in of_frame):
                 raise FrameError(f"{path}: truncated: pixels of frame {first} lie beyond the end of the file")
             stored = np.stack([page.asarray(maxworkers=1) for page in of_frame if page is not None])
-            return (np.moveaxis(stored, -1, 1) if info.channels_last else stored).reshape(1, *info.shape[1:])
+            return (np.moveaxis(stored, -1, 1) if channels_last else stored).reshape(1, *info.shape[1:])
 
-        return BlockReader(path, info, read, close=opened.pop_all().close)
+        return FrameReader(path, info, read, close=opened.pop_all().close)
 
 
 # Metadata
@@ -279,7 +266,6 @@ def write_tiff(
     """Write a TIFF file frame by frame; arguments as in ``StackFormat.write``, and from ``storage_of``."""
     # Three or four channels are stored last (RGB), others as planes of a page.
     colour = info.axes == "TCHW" and info.shape[1] in (3, 4)
-    stored = replace(info, channels_last=colour)
     axes = "TYX" if info.axes == "THW" else "TYXS" if colour else "TSYX" if info.shape[1] > 1 else "TCYX"
     # Metadata: full scale and times as JSON, all others as tags.
     tags = {tag.code: tag for tag in info.metadata.values() if tag is not None}
@@ -298,9 +284,10 @@ def write_tiff(
     if tags.keys() >= _RESOLUTION:
         x, y, unit = (tags[code].value for code in sorted(_RESOLUTION))
         options |= {"resolution": (x, y), "resolutionunit": unit}
-    pages = (stored.to_stored(frame) for frame in frames)
-    if stored.stored_axes == "TCHW" and "tile" not in storage:
+    shape = (info.shape[0], *info.shape[2:], info.shape[1]) if colour else info.shape
+    pages = (np.ascontiguousarray(np.moveaxis(f, 0, -1) if colour else f, info.dtype) for f in frames)
+    if len(shape) == 4 and not colour and "tile" not in storage:
         pages = (plane for frame in pages for plane in frame)
     # an iterator would have to yield the tiles
     data = np.stack(list(pages)) if "tile" in storage else pages
-    tifffile.imwrite(path, data=data, maxworkers=1, shape=stored.stored_shape, dtype=info.dtype, **options)
+    tifffile.imwrite(path, data=data, maxworkers=1, shape=shape, dtype=info.dtype, **options)

@@ -16,7 +16,7 @@ KEPT = [0, 1, 2, 4, 5, 9, 10]  # the other frames were dropped
 
 def info_with(times, error=1e-3):
     times = tuple(float(time) for time in times)
-    return StackInfo((len(times), 8, 8), "uint8", 255.0, times, time_error=error, time_source="time stamps")
+    return StackInfo((len(times), 8, 8), "uint8", 255.0, times, time_error=error)
 
 
 def test_rounded_times_are_used_to_find_dropped_frames():
