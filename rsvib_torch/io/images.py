@@ -184,7 +184,7 @@ def _write_file(file: Path, info: StackInfo, frame: Array, source: Path | None =
             with closing(_open_image(source)) as reader:
                 like, storage = reader.info, storage_of(source)
             times = None if like.time_error else like.frame_times
-            one = replace(one, frame_times=times, metadata=like.metadata_for(one.shape))
+            one = replace(one, frame_times=times, metadata=like.with_shape(one.shape).metadata)
     write_tiff(file, one, iter([frame]), None, storage)
 
 

@@ -137,26 +137,23 @@ class StackInfo(Summarised):
         """Size of a frame in bytes."""
         return int(np.prod(self.shape[1:], dtype=object)) * np.dtype(self.dtype).itemsize
 
+    def with_shape(self, shape: tuple[int, ...]) -> "StackInfo":
+        """A stack of another shape: times and files belong to its number of frames, a georeference to their size."""
+        metadata = self.metadata
+        if shape[-2:] != self.shape[-2:]:
+            metadata = {name: None if tag is None or tag.scope == "image" else tag for name, tag in metadata.items()}
+        if shape[0] != self.shape[0]:
+            return replace(self, shape=shape, metadata=metadata, frame_times=None, path=None, files=None)
+        return replace(self, shape=shape, metadata=metadata)
+
     def with_frames(self, count: int) -> "StackInfo":
-        """The same kind of stack with ``count`` frames; times and path are kept only if their number is unchanged."""
-        if count == self.shape[0]:
-            return self
-        shape = (count, *self.shape[1:])
-        return replace(self, shape=shape, frame_times=None, path=None, files=None)
+        """The same kind of stack with ``count`` frames."""
+        return self.with_shape((count, *self.shape[1:]))
 
     def restored_as(self, scale: int, mosaic: str | None) -> "StackInfo":
         """The kind of stack of the restored frames: ``scale`` times the rows and columns, colours of a mosaic."""
-        if scale == 1 and mosaic is None:
-            return self
         channels = self.shape[1:-2] if mosaic is None else (3,)
-        shape = (self.shape[0], *channels, scale * self.shape[-2], scale * self.shape[-1])
-        return replace(self, shape=shape, path=None, metadata=self.metadata_for(shape))
-
-    def metadata_for(self, shape: tuple[int, ...]) -> dict[str, Tag | None]:
-        """The metadata of a stack of another shape: None for those that are valid for frames of the same size only."""
-        if shape[-2:] == self.shape[-2:]:
-            return dict(self.metadata)
-        return {name: None if tag is None or tag.scope == "image" else tag for name, tag in self.metadata.items()}
+        return self.with_shape((self.shape[0], *channels, scale * self.shape[-2], scale * self.shape[-1]))
 
 
 _RANGE = re.compile(r"(.+)\[(\d*):(\d*)\]")

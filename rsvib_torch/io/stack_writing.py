@@ -58,9 +58,9 @@ def _planned(shape: tuple[int, ...], dtype: str | None, full_scale: float | None
     info = StackInfo(tuple(shape), kind.name, full_scale)
     if like is None:
         return info
-    kept, metadata = like.with_frames(shape[0]), like.metadata_for(info.shape)
-    exact = replace(kept, frame_times=None if kept.time_error else kept.frame_times, time_error=0.0)
-    return replace(exact, shape=info.shape, dtype=info.dtype, full_scale=full_scale, metadata=metadata)
+    kept = like.with_shape(info.shape)
+    times = None if kept.time_error else kept.frame_times
+    return replace(kept, dtype=info.dtype, full_scale=full_scale, frame_times=times, time_error=0.0)
 
 
 def check_stack_target(
@@ -94,7 +94,7 @@ def metadata_not_kept(like: StackInfo, path: PathLike, shape: tuple[int, ...]) -
     keeps = FORMATS[".tif"].keeps if in_files else form.keeps
     stated = like.full_scale not in (None, known_full_scale(np.dtype(like.dtype)))
     timed = like.frame_times is not None and not like.time_error
-    lost = [name for name, tag in like.metadata_for(shape).items() if tag is None or "metadata" not in keeps]
+    lost = [name for name, tag in like.with_shape(shape).metadata.items() if tag is None or "metadata" not in keeps]
     if in_files and shape[-2:] == like.shape[-2:]:  # otherwise a georeference is lost
         lost = [name for name in lost if not name.endswith(DIFFERENT)]
     others = {"full_scale": stated, "orientation": like.orientation != 1}
