@@ -44,12 +44,6 @@ _MATRICES = {
     7: (0, -1, -1, 0), 8: (0, -1, 1, 0),
 }  # fmt: skip
 
-_GOPRO_FIRMWARE = {
-    "HD5.02": "GoPro HERO5 Black",
-    "HD5.03": "GoPro HERO5 Session",
-    "HD6.01": "GoPro HERO6 Black",
-    "HD7.01": "GoPro HERO7 Black",
-}  # the first characters of its version
 _FRAMES = 8  # decoded frames of a decoder; each has at most 6 bytes per pixel
 _av = partial(needed_package, "av", "reading and writing video", "video")
 
@@ -154,12 +148,12 @@ def _listed_times(container: InputContainer, stream: av.VideoStream) -> list[Fra
 
 
 def _camera(tags: dict[str, str]) -> str | None:
-    """Make and model of the camera in the tags of a video: QuickTime, Android, or the firmware of GoPro."""
+    """Make and model of the camera in the tags of a video: QuickTime or Android."""
     makes = ("com.apple.quicktime.make", "com.android.manufacturer", "make")
     for make, model in zip(makes, ("com.apple.quicktime.model", "com.android.model", "model"), strict=True):
         if tags.get(model):
             return camera_name(tags.get(make), tags[model])
-    return _GOPRO_FIRMWARE.get(tags.get("firmware", "")[:6])
+    return None
 
 
 @lru_cache(maxsize=8)
