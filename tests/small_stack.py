@@ -1,7 +1,6 @@
 """A small vibrating stack, simulated by the independent camera of tests/truth.py, and its processing."""
 
-import json
-
+import h5py
 import numpy as np
 import tifffile
 from scipy import ndimage
@@ -56,12 +55,11 @@ def write_small(path, frames=FRAMES):
 
 
 def write_with_gaps(folder, kept, start=0.0):
-    """Write the kept frames of the stack as big-endian raw counts that state their times and a resolution."""
-    (folder / "frames.raw").write_bytes(draw_counts(max(kept) + 1)[list(kept)].astype(">u2").tobytes())
-    sidecar = {"format": "rsvib raw", "version": 1, "shape": [len(kept), HEIGHT, WIDTH], "axes": "THW"}
-    sidecar |= {"dtype": "uint16", "byte_order": "big", "full_scale": 4095, "resolution": [120.0, 60.0, "centimeter"]}
+    """Write the kept frames of the stack as big-endian counts that state their times."""
     times = [start + index * TIMING.frame_period for index in kept]
-    (folder / "frames.raw.json").write_text(json.dumps(sidecar | {"frame_times": times}))
+    with h5py.File(folder / "frames.h5", "w") as file:
+        file["frames"] = draw_counts(max(kept) + 1)[list(kept)].astype(">u2")
+        file["frames"].attrs.update(full_scale=4095, frame_times=times)
     return times
 
 

@@ -188,7 +188,7 @@ class StackCommand(RangeOptions, CameraOptions, DeviceOptions):
     """A command that reads a stack of frames."""
 
     frames: Path = argument()
-    """Stack of frames: TIFF, .npy, HDF5, Zarr, raw, video, or a folder of PNG, TIFF or JPEG files."""
+    """Stack of frames: TIFF, .npy, HDF5, Zarr, video, or a folder of PNG, TIFF or JPEG files."""
 
     @cached_property
     def stack(self) -> Path:

@@ -150,15 +150,13 @@ def check_writable(path: Path, *, folder: bool = False) -> None:
 
 
 @contextmanager
-def whole(path: _Path, kind: Kind = "file", companions: tuple[str, ...] = ()) -> Iterator[Path]:
+def whole(path: _Path, kind: Kind = "file") -> Iterator[Path]:
     """Write a file or folder under a temporary name; it gets its name when the block ends without an exception.
 
     It is on the disk then. The folders above it are created. An existing file or tree is replaced; an existing folder
-    keeps its other files. The block creates what has the temporary name. ``kind``, and ``companions``, the endings of
-    files beside it, are as in ``StackFormat``.
+    keeps its other files. The block creates what has the temporary name. ``kind`` is as in ``StackFormat``.
     """
     target = Path(path)
-    endings = (*companions, "")  # what describes a file is there before it
     check_target(target, kind, parent_exists=False)
     with temporary_folder(target) as folder:
         yield folder / target.name
@@ -169,7 +167,7 @@ def whole(path: _Path, kind: Kind = "file", companions: tuple[str, ...] = ()) ->
         if kind == "folder" and target.is_dir():
             moves = [(file, target / file.name) for file in sorted((folder / target.name).iterdir())]
         else:
-            moves = [(folder / f"{target.name}{end}", target.with_name(f"{target.name}{end}")) for end in endings]
+            moves = [(folder / target.name, target)]
         for part, final in moves:
             check_target(final, "file" if part.is_file() else "folder", parent_exists=False)
         for part, final in moves:

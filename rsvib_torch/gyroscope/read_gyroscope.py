@@ -27,13 +27,11 @@ from rsvib_torch.text import one_line, quoted
 
 RateUnit = Literal["rad/s", "deg/s"]
 _RADIANS = {"rad/s": 1.0, "deg/s": math.pi / 180}
-_TIME_NAME = re.compile(r"(?:t|time|timestamp)(?:[ _]?[(\[]?(?P<unit>s|ms|us|ns)[)\]]?)?")
-_RATE_NAME = re.compile(
-    r"(?:gyro(?:scope)?[ _]?|angular_velocity[ _]?|rate[ _]?|omega[ _]?|[grw])?(?P<axis>[xyz])"
-    r"(?:[ _]?[(\[]?(?P<unit>rad/s|rad_s|rads|deg/s|deg_s|dps)[)\]]?)?"
+_COLUMN_NAME = re.compile(
+    r"(?:(?P<time>t|time|timestamp)|"
+    r"(?:gyro(?:scope)?[ _]?|angular_velocity[ _]?|rate[ _]?|omega[ _]?|[grw])?(?P<axis>[xyz]))"
+    r"(?:[ _]?[(\[]?(?P<unit>s|ms|us|ns|rad/s|rad_s|rads|deg/s|deg_s|dps)[)\]]?)?"
 )
-
-
 _MARKS = (b"GYROFLOW IMU LOG", b"CAMERA IMU LOG")  # at the begin of a gyroflow log
 _MAX_HEADER = 1000  # lines
 
@@ -51,43 +49,40 @@ def _read_table(path: Path, is_log: bool, unit: str | None, time_unit: str | Non
         axes = header.get("orientation", ["", "XYZ"])[1]
         scales = (_scale(path, header, name) for name in ("tscale", "gscale"))
         return times * next(scales), rates * next(scales), f"gyroflow log, orientation {axes}", axes
-    for name, given, stated in (("time_unit", time_unit, units["time"]), ("unit", unit, units["rate"])):
-        if len(stated | ({given} - {None})) > 1:
-            kinds = ", ".join(sorted(stated))
-            raise ValueError(f"{path}: the first line states {kinds}" + (f", {name} is {given!r}" if given else ""))
-    rate_unit = unit or next(iter(units["rate"]), None)
+    rate_units = {"rad/s" if name.startswith("rad") else "deg/s" for name in units[1:] if name}
+    rate_unit = _unit(path, "unit", rate_units, unit)
     if rate_unit is None:
         raise ValueError(f"{path}: the unit of the rates is not stated; pass unit='rad/s' or unit='deg/s'")
-    return times * SECONDS[time_unit or next(iter(units["time"]), "s")], rates * _RADIANS[rate_unit], "CSV", "XYZ"
+    seconds = SECONDS[_unit(path, "time_unit", {*units[:1]} - {""}, time_unit) or "s"]
+    return times * seconds, rates * _RADIANS[rate_unit], "CSV", "XYZ"
 
 
-def _columns(path: Path, names: list[str]) -> tuple[list[int], dict[str, set[str]]]:
-    """Columns of the time and of the rates about x, y and z, and the units that their names state."""
-    found: dict[str, int] = {}
-    units: dict[str, set[str]] = {"time": set(), "rate": set()}
-    for column, name in enumerate(names):
-        for kind, match in (("time", _TIME_NAME.fullmatch(name)), ("rate", _RATE_NAME.fullmatch(name))):
-            if match is None:
-                continue
-            quantity = "time" if kind == "time" else match["axis"]
-            if quantity in found:
-                raise ValueError(
-                    f"{path}: columns {quoted(names[found[quantity]])} and {quoted(name)} "
-                    f"could both be {quantity}; rename one of them"
-                )
-            found[quantity] = column
-            if match["unit"]:
-                of_rate = "rad/s" if match["unit"].startswith("rad") else "deg/s"
-                units[kind].add(match["unit"] if kind == "time" else of_rate)
+def _columns(path: Path, names: list[str]) -> tuple[list[int], list[str]]:
+    """Columns of the time and of the rates about x, y and z, and the unit that the name of each states, or nothing."""
+    matches = [(column, match) for column, name in enumerate(names) if (match := _COLUMN_NAME.fullmatch(name))]
+    matches = [one for one in matches if not one[1]["unit"] or (one[1]["unit"] in SECONDS) == bool(one[1]["time"])]
+    columns, units = list[int](), list[str]()
     for quantity in ("time", "x", "y", "z"):
-        if quantity not in found:
+        found = [one for one in matches if quantity == ("time" if one[1]["time"] else one[1]["axis"])]
+        if len(found) != 1:
             what = "time" if quantity == "time" else f"rate about {quantity}"
+            number = "no column" if not found else f"{len(found)} columns"
             present = one_line(", ".join(names) or "nothing", 200)
             raise ValueError(
-                f"{path}: no column of the {what}; expected names such as time, gx, gy, gz in the line of names, which "
-                f"has {present}"
+                f"{path}: {number} of the {what}; expected one each, with names such as time, gx, gy, gz in the line "
+                f"of names, which has {present}"
             )
-    return [found[quantity] for quantity in ("time", "x", "y", "z")], units
+        columns.append(found[0][0])
+        units.append(found[0][1]["unit"] or "")
+    return columns, units
+
+
+def _unit(path: Path, name: str, stated: set[str], given: str | None) -> str | None:
+    """The only unit that the names of the columns state, or that is given; None if there is none."""
+    if len(stated | ({given} - {None})) > 1:
+        kinds = ", ".join(sorted(stated))
+        raise ValueError(f"{path}: the first line states {kinds}" + (f", {name} is {given!r}" if given else ""))
+    return given or next(iter(stated), None)
 
 
 def _header(path: Path, lines: Iterator[str]) -> tuple[dict[str, list[str]], int]:

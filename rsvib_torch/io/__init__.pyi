@@ -1,13 +1,11 @@
-from .formats import StackFormat as StackFormat
-from .formats import register_format as register_format
+from .frame_reader import FrameError as FrameError
+from .frame_reader import FrameReader as FrameReader
 from .frame_times import describe_stack as describe_stack
 from .frame_times import exposure_times as exposure_times
 from .frame_times import stated_rate as stated_rate
 from .frame_times import timing_from_first_frame as timing_from_first_frame
 from .full_scale import counts_to_frames as counts_to_frames
 from .stack_info import H264 as H264
-from .stack_info import FrameError as FrameError
-from .stack_info import FrameReader as FrameReader
 from .stack_info import StackInfo as StackInfo
 from .stack_info import is_video as is_video
 from .stack_info import split_range as split_range

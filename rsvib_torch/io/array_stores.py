@@ -8,7 +8,6 @@ import stat
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
@@ -16,11 +15,9 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from rsvib_torch.checks.values import Value, needed_package
-from rsvib_torch.files.reading import Table
-from rsvib_torch.io.blocks import BlockReader
-from rsvib_torch.io.full_scale import check_dtype
-from rsvib_torch.io.stack_info import StackInfo, readable_stack
-from rsvib_torch.io.stated_metadata import attributes_of, info_from_attributes, time_attributes, times_of_attributes
+from rsvib_torch.io.frame_reader import FrameReader, readable_stack
+from rsvib_torch.io.stack_info import StackInfo
+from rsvib_torch.io.stated_metadata import attributes_of, info_of_array
 from rsvib_torch.numerics.tables import Array
 
 if TYPE_CHECKING:
@@ -48,20 +45,18 @@ def _only(arrays: Mapping[str, Value]) -> Value:
 
 
 def _info(array: Stored) -> StackInfo:
-    check_dtype(array.dtype)
-    return info_from_attributes(dict(array.attrs), tuple(int(size) for size in array.shape), array.dtype)
+    return info_of_array(tuple(int(size) for size in array.shape), array.dtype, dict(array.attrs))
 
 
 def _reader(
     path: Path, info: StackInfo, array: Stored, more_bytes: int, close: Callable[[], None] = lambda: None
-) -> BlockReader:
+) -> FrameReader:
     """Reader of an array, (T, ...) or a single frame, with the frames of a chunk together."""
 
     def read(first: int, last: int) -> Array:
-        frames = np.asarray(array[first:last]) if array.ndim > 2 else np.asarray(array[...])[None]
-        return np.moveaxis(frames, -1, 1) if info.stored_axes == "THWC" else frames
+        return np.asarray(array[first:last]) if array.ndim > 2 else np.asarray(array[...])[None]
 
-    return BlockReader(path, info, read, array.chunks[0] if array.chunks and array.ndim > 2 else 1, more_bytes, close)
+    return FrameReader(path, info, read, array.chunks[0] if array.chunks and array.ndim > 2 else 1, more_bytes, close)
 
 
 # HDF5
@@ -70,7 +65,7 @@ _h5py = partial(needed_package, "h5py", "reading and writing HDF5", "formats")
 
 
 def _find_dataset(file: File) -> Dataset:
-    """The only dataset of frames, or the one called ``frames``; links and external data are not followed."""
+    """The only dataset of frames, or the one called ``frames``, among members of the file itself."""
     h5py = _h5py()
     found: dict[str, Dataset] = {}
     members = itertools.count(1)
@@ -82,18 +77,11 @@ def _find_dataset(file: File) -> Dataset:
             found[name] = member
 
     file.visititems(visit)  # every member once, without links
-    if not isinstance(file.get(_NAME, getlink=True, default=h5py.HardLink()), h5py.HardLink):
-        raise ValueError(f"its dataset {_NAME!r} is a link; frames must be in the file itself")
     stacks = {name: member for name, member in found.items() if member.ndim > 2 or name == _NAME}
     dataset = _only(stacks or found)
-    if _is_outside(dataset):
+    if dataset.external or dataset.is_virtual:
         raise ValueError(f"its dataset {dataset.name} lies in other files; frames must be in the file itself")
     return dataset
-
-
-def _is_outside(dataset: Dataset) -> bool:
-    """Whether the values of a dataset lie in other files or datasets."""
-    return bool(dataset.external or dataset.is_virtual)
 
 
 def _check_dataset(dataset: Dataset, file_size: int) -> int:
@@ -110,23 +98,7 @@ def _check_dataset(dataset: Dataset, file_size: int) -> int:
     return chunk
 
 
-def _times_beside(file: File, dataset: Dataset, count: int) -> Table:
-    """Times and frame rate in datasets beside the frames, or in attributes of their group or of the file."""
-    h5py = _h5py()
-    found: Table = {}
-    for group in (file, dataset.parent):
-        found |= time_attributes(group.attrs)
-        for name in time_attributes(dict.fromkeys(group)):
-            member = group[name] if isinstance(group.get(name, getlink=True), h5py.HardLink) else None
-            if not isinstance(member, h5py.Dataset) or _is_outside(member):
-                continue
-            if member.shape in ((), (1,), (count,)) and member.dtype.kind in "iuf":
-                found[name] = member[...]
-                found |= {f"{name}_units": member.attrs[key] for key in ("unit", "units") if key in member.attrs}
-    return times_of_attributes(found, count)
-
-
-def open_hdf5(path: Path) -> BlockReader:
+def open_hdf5(path: Path) -> FrameReader:
     """Open the dataset of a file that has the shape of a stack."""
     h5py = _h5py()
     with readable_stack(path, "HDF5"), ExitStack() as opened:
@@ -134,8 +106,6 @@ def open_hdf5(path: Path) -> BlockReader:
         dataset = _find_dataset(file)
         info = _info(dataset)
         chunk = _check_dataset(dataset, path.stat().st_size)
-        if info.frame_times is None and info.frame_rate is None:
-            info = replace(info, **_times_beside(file, dataset, info.shape[0]))
         # one decoded chunk besides the block; measured with gzip, lzf, shuffle and without compression
         return _reader(path, info, dataset, chunk, opened.pop_all().close)
 
@@ -152,13 +122,13 @@ def write_hdf5(path: Path, info: StackInfo, frames: Iterator[Array], compression
         layout.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
         layout.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
         kind = np.dtype(info.dtype).newbyteorder("<")
-        dataset = file.create_dataset(_NAME, info.stored_shape, kind, dcpl=layout, track_times=False)
+        dataset = file.create_dataset(_NAME, info.shape, kind, dcpl=layout, track_times=False)
         dataset.attrs.update(attributes_of(info))
         offset = int(dataset.id.get_offset())
     with path.open("r+b") as pixels:
         pixels.seek(offset)
         for frame in frames:
-            pixels.write(info.to_stored(frame).data)
+            pixels.write(np.ascontiguousarray(frame, kind).data)
 
 
 # Zarr
@@ -182,7 +152,7 @@ def _check_sizes(array: Stored, info: StackInfo, folder: Path) -> None:
         raise ValueError(f"its header states {stated}, the folder holds {held} bytes")
 
 
-def open_zarr(path: Path) -> BlockReader:
+def open_zarr(path: Path) -> FrameReader:
     """Open the array of a folder, or of a group its only array or the one called ``frames``."""
     zarr = _zarr()
     with readable_stack(path, "Zarr"):
@@ -207,19 +177,19 @@ def write_zarr(path: Path, info: StackInfo, frames: Iterator[Array], compression
     group = _zarr().create_group(store=str(path), zarr_format=3)
     array = group.create_array(
         _NAME,
-        shape=info.stored_shape,
-        chunks=(1, *info.stored_shape[1:]),
+        shape=info.shape,
+        chunks=(1, *info.shape[1:]),
         dtype=info.dtype,
         fill_value=0,
         config={"write_empty_chunks": True},
         attributes=attributes_of(info),
-        dimension_names=[_DIMENSIONS[axis] for axis in info.stored_axes],
+        dimension_names=[_DIMENSIONS[axis] for axis in info.axes],
     )
     if info.frame_times is not None:
         times = np.asarray(info.frame_times)
         group.create_array("time", data=times, dimension_names=["frame"], attributes={"units": "s"})
     for index, frame in enumerate(frames):
-        array[index] = info.to_stored(frame)
+        array[index] = np.asarray(frame, info.dtype)
     # copy the metadata of the arrays into the header of the group; xarray warns where it reads them one by one
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # other programs read the headers of the arrays, which remain

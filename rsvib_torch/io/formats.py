@@ -7,9 +7,11 @@ from typing import Literal
 
 from rsvib_torch.files.reading import check_regular
 from rsvib_torch.io.array_stores import open_hdf5, open_zarr, write_hdf5, write_zarr
-from rsvib_torch.io.flat_files import check_npy, open_npy, open_raw, write_npy, write_raw
+from rsvib_torch.io.frame_reader import FrameReader
 from rsvib_torch.io.images import check_images, open_images, write_images
-from rsvib_torch.io.stack_info import FFV1, H264, READ_ONLY_VIDEO, FrameReader, StackInfo
+from rsvib_torch.io.numpy_files import open_npy, write_npy
+from rsvib_torch.io.stack_info import FFV1, H264, READ_ONLY_VIDEO, StackInfo
+from rsvib_torch.io.stated_metadata import check_array
 from rsvib_torch.io.tiff import open_tiff, write_tiff
 from rsvib_torch.io.video import VideoReader, check_video, write_video
 from rsvib_torch.numerics.tables import Array
@@ -18,7 +20,7 @@ from rsvib_torch.text import quoted
 
 @dataclass(frozen=True)
 class StackFormat:
-    """How stacks are stored in files with certain endings; docs/stacks.md, "Other formats", has the contract."""
+    """How stacks are stored in files with certain endings; docs/architecture.md has the contract."""
 
     name: str  # in messages
     endings: tuple[str, ...]  # lower case with the dot; ``""`` is a name without an ending
@@ -31,52 +33,34 @@ class StackFormat:
     check: Callable[[Path, StackInfo], None] | None = None  # raises an error if a stack cannot be written to a path
     kind: Literal["file", "folder", "tree"] = "file"  # a "folder" may contain other files; a "tree" is replaced as one
     marker: str = ""  # file that identifies a folder of any name as a stack of this format
-    companions: tuple[str, ...] = ()  # endings of additional files, which are appended to the file name
     compressions: tuple[str, ...] = ()  # values of ``compression`` besides None
     keeps: tuple[str, ...] = ()  # attributes of ``StackInfo`` that are stored besides the pixels
 
 
-_KEPT = ("full_scale", "frame_times", "orientation", "resolution")
-_KEPT_BY_PNG = ("full_scale", "orientation", "resolution")
-_KEPT_BY_VIDEO = ("full_scale", "frame_times", "orientation")
+_KEPT = ("full_scale", "frame_times", "orientation")
+_KEPT_BY_PNG = ("full_scale", "orientation")
 
 # The order is that of error messages.
 _FORMATS_OF_THE_PACKAGE = (
-    StackFormat("npy", (".npy",), open_npy, write_npy, check=check_npy),
-    StackFormat("hdf5", (".h5", ".hdf5", ".hdf"), open_hdf5, write_hdf5, keeps=_KEPT),
+    StackFormat("npy", (".npy",), open_npy, write_npy, check=check_array),
+    StackFormat("hdf5", (".h5", ".hdf5", ".hdf"), open_hdf5, write_hdf5, check=check_array, keeps=_KEPT),
     StackFormat("jpeg", (".jpg", ".jpeg"), open_images),
     StackFormat("png", (".png",), open_images, write_images, ("uint8", "uint16"), check_images, keeps=_KEPT_BY_PNG),
     StackFormat(
         "image folder", ("",), open_images, write_images, check=check_images, kind="folder", keeps=_KEPT_BY_PNG
     ),
-    StackFormat("raw", (".raw",), open_raw, write_raw, companions=(".json",), keeps=_KEPT),
     StackFormat(
         "tiff", (".tif", ".tiff"), open_tiff, write_tiff, compressions=("zlib", "lzma"), keeps=(*_KEPT, "metadata")
     ),
-    StackFormat("FFV1 video", FFV1, VideoReader, write_video, ("uint8", "uint16"), check_video, keeps=_KEPT_BY_VIDEO),
-    StackFormat("H.264 video", H264, VideoReader, write_video, check=check_video, keeps=_KEPT_BY_VIDEO),
+    StackFormat("FFV1 video", FFV1, VideoReader, write_video, ("uint8", "uint16"), check_video, keeps=_KEPT),
+    StackFormat("H.264 video", H264, VideoReader, write_video, check=check_video, keeps=_KEPT),
     StackFormat("avi, webm, mpeg, 3gp and wmv", READ_ONLY_VIDEO, VideoReader),
-    StackFormat("zarr", (".zarr",), open_zarr, write_zarr, kind="tree", marker="zarr.json", keeps=_KEPT),
+    StackFormat(
+        "zarr", (".zarr",), open_zarr, write_zarr, check=check_array, kind="tree", marker="zarr.json", keeps=_KEPT
+    ),
 )
 FORMATS: dict[str, StackFormat] = {ending: form for form in _FORMATS_OF_THE_PACKAGE for ending in form.endings}
 """Format of every file ending."""
-
-
-def register_format(form: StackFormat) -> None:
-    """Register a format for reading and writing stacks; it replaces earlier formats of the same endings.
-
-    Example:
-        >>> register_format(StackFormat("portable", ("pgm",), open=lambda path: None))
-        Traceback (most recent call last):
-        ...
-        ValueError: endings must be like '.tif', got 'pgm'
-    """
-    if not form.endings:
-        raise ValueError(f"format {form.name!r} has no file ending; expected at least one, like '.tif'")
-    for ending in form.endings:
-        if ending and (not ending.startswith(".") or ending != ending.lower()):
-            raise ValueError(f"endings must be like '.tif', got {ending!r}")
-    FORMATS.update(dict.fromkeys(form.endings, form))
 
 
 def find_format(path: Path) -> StackFormat:

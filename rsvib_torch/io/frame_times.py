@@ -1,10 +1,10 @@
 """Times and frame rate that a file states, compared with the sensor and used as exposure starts of the frames."""
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.io.stack_info import StackInfo
@@ -26,17 +26,16 @@ _ORIENTATIONS = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class _Spacing:
+class _Spacing(NamedTuple):
     """Spacing of the frames of a file."""
 
-    # (T,) intervals from the first frame to each, several where frames were dropped; None if the rate is variable:
-    # times are not whole intervals apart, to within their error, 2 % (clock of a camera), and a quarter of one, which
-    # is also allowed where their deviations do not add up
-    numbers: NDArray[np.float64] | None
+    # intervals from the first frame to each, several where frames were dropped; empty if only a rate is stated; None if
+    # the rate is variable: times are not whole intervals apart, to within their error, 2 % (clock of a camera), and a
+    # quarter of one, which is also allowed where their deviations do not add up
+    numbers: list[float] | None
     interval: float  # s, without dropped frames: of a straight line, or the median if the rate is variable
     limits: tuple[float, float]  # s, shortest and longest interval if the rate is variable, otherwise ``interval``
-    error: float  # s, of ``interval`` due to the error of the times
+    error: float = 0.0  # s, of ``interval`` due to the error of the times
     jitter: float = 0.0  # s, largest deviation of the times from whole intervals
 
 
@@ -54,23 +53,22 @@ def _spacing(info: StackInfo) -> _Spacing | None:
             f"{info.path or 'the file'}: {stated} is not that of a camera: times in seconds must be finite and "
             f"increase; correct or remove it ({info.time_source})"
         )
-    if few:
-        period = float(intervals[0])
-        return _Spacing(np.zeros(0), period, (period, period), 0.0)
     median = float(np.median(intervals))
+    if few:
+        return _Spacing([], median, (median, median))
+    # 1. Frames at whole numbers of intervals: a straight line, and deviations from it.
     single = float(intervals[np.round(intervals / median) == 1].mean())  # more accurate if times are rounded
     whole = np.round(intervals / single)
     numbers = np.concatenate([[0.0], np.cumsum(whole)])
-    line = np.polynomial.Polynomial.fit(numbers, times, 1)
-    deviations = times - line(numbers)
+    interval, start = np.polyfit(numbers, times, 1).tolist()
+    deviations = times - (start + interval * numbers)
     jitter = float(np.abs(deviations).max())
-    # Durbin-Watson: 2 if the deviations are independent (clock of the program that records), 0 if intervals differ and
-    # add up, 4 if they alternate
+    # 2. Durbin-Watson: 2 if the deviations are independent (clock of the program that records), 0 if intervals differ
+    # and add up, 4 if they alternate.
     independence = float(np.square(np.diff(deviations)).sum() / max(np.square(deviations).sum(), 1e-300))
     is_clock = info.time_error > 0.0 and len(times) >= _MIN_STAMPS and 1.0 < independence < 3.0
     if whole.min() >= 1 and jitter <= 0.25 * single and (is_clock or jitter <= max(info.time_error, 0.02 * single)):
-        interval = float(line.convert().coef[1])
-        return _Spacing(numbers, interval, (interval, interval), info.time_error / float(numbers[-1]), jitter)
+        return _Spacing(numbers.tolist(), interval, (interval, interval), info.time_error / float(numbers[-1]), jitter)
     return _Spacing(None, median, (float(intervals.min()), float(intervals.max())), info.time_error)
 
 
@@ -96,23 +94,19 @@ def _same_rate(spacing: _Spacing, info: StackInfo, timing: SensorTiming) -> bool
 def exposure_times(info: StackInfo, timing: SensorTiming) -> tuple[float, ...] | None:
     """Exposure start of every frame according to its file, in seconds; None if it is not stated, or at another rate.
 
-    If a file without times states that frames are missing, the result consists of multiples of the sensor's frame
-    period. Exact times are returned as they are. Times with an error, e.g. the presentation times of a video, are used
-    only if their interval is the frame period of the sensor to 1 %, or their intervals include it. If they are whole
-    numbers of intervals apart to within their error or 2 % of a period, or a quarter of one with independent
-    deviations, the result consists of multiples of the sensor's frame period, with gaps where frames were dropped.
-    Otherwise the frame rate is variable: the times are
-    returned as they are if their error is less than a tenth of a period.
+    Exact times are returned as they are. Times with an error, e.g. the presentation times of a video, are used only if
+    their interval is the frame period of the sensor to 1 %, or their intervals include it. If they are whole numbers of
+    intervals apart to within their error or 2 % of a period, or a quarter of one with independent deviations, the
+    result consists of multiples of the sensor's frame period, with gaps where frames were dropped. Otherwise the frame
+    rate is variable: the times are returned as they are if their error is less than a tenth of a period.
     """
-    if info.frame_times is None and info.frame_numbers is not None:
-        return tuple(number * timing.frame_period for number in info.frame_numbers)
     if info.frame_times is None or info.time_error == 0.0:
         return info.frame_times
     spacing = _spacing(info)
     if spacing is None or not _same_rate(spacing, info, timing):
         return None
     if spacing.numbers is not None:
-        return tuple(float(number) * timing.frame_period for number in spacing.numbers)
+        return tuple(number * timing.frame_period for number in spacing.numbers)
     return info.frame_times if info.time_error <= 0.1 * timing.frame_period else None
 
 
@@ -168,25 +162,23 @@ def timing_from_first_frame(timing: SensorTiming, info: StackInfo) -> SensorTimi
 
 def describe_stack(info: StackInfo, timing: SensorTiming | None) -> list[str]:
     """Sentences about an orientation, dropped frames and unequal intervals that a file states."""
-    name, notes, missing, source = info.path or "the file", [], 0, f"its {info.time_source}"
+    name, notes, source = info.path or "the file", [], f"its {info.time_source}"
     if info.orientation in _ORIENTATIONS:
         displayed = _ORIENTATIONS[info.orientation]
         notes.append(f"{name}: displayed {displayed}; rows, x and y are those of the stored frames")
     if timing is None or timing.frame_start_times is not None:
         return notes
     times, spacing = exposure_times(info, timing), _spacing(info)
-    if info.frame_times is None and info.frame_numbers is not None:
-        missing, source = info.frame_numbers[-1] + 1 - info.shape[0], "the numbers in the file names"
-    elif times is not None and spacing is not None and spacing.numbers is None:
+    if times is None or spacing is None:
+        return notes
+    if spacing.numbers is None:
         low, high = (1e3 * interval for interval in spacing.limits)
         error = f"whose error is up to {1e3 * info.time_error:.2g} ms; --frame-rate selects equal intervals"
         notes.append(f"{name}: frame intervals of {low:.4g} to {high:.4g} ms; {source} are used, {error}")
-    elif times is not None and spacing is not None and spacing.numbers is not None and len(spacing.numbers):
-        missing = round(float(spacing.numbers[-1])) + 1 - len(times)
-    if missing:
+    elif spacing.numbers and (missing := round(spacing.numbers[-1]) + 1 - len(times)):
         are = "frame is" if missing == 1 else "frames are"
         notes.append(f"{name}: {missing} {are} missing according to {source}, which are used")
-    if times is not None and spacing is not None and spacing.jitter > max(info.time_error, 0.02 * spacing.interval):
+    if spacing.jitter > max(info.time_error, 0.02 * spacing.interval):
         scatter = f"{source} scatter by up to {1e3 * spacing.jitter:.2g} ms like those of a program that records"
         notes.append(f"{name}: {scatter}; equal intervals are used, set frame_start_times if they are not")
     return notes

@@ -18,13 +18,16 @@ from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile, putchunk
 
 from rsvib_torch.files.reading import Table
-from rsvib_torch.io.blocks import BlockReader
+from rsvib_torch.io.frame_reader import FrameError, FrameReader, readable_stack
 from rsvib_torch.io.full_scale import known_full_scale
-from rsvib_torch.io.stack_info import DIFFERENT, FrameError, StackInfo, Tag, readable_stack
-from rsvib_torch.io.stated_metadata import exif_fields, merged_times
+from rsvib_torch.io.stack_info import DIFFERENT, StackInfo, Tag
+from rsvib_torch.io.stated_metadata import exif_fields
 from rsvib_torch.io.tiff import open_tiff, storage_of, write_tiff
 from rsvib_torch.numerics.tables import Array
 
+_PNG, _TIFF, _JPEG = (".png",), (".tif", ".tiff"), (".jpg", ".jpeg")
+_KINDS = {"PNG": _PNG, "TIFF": _TIFF, "JPEG": _JPEG}
+_PNG_TYPES = ("uint8", "uint16")
 _FULL_SCALE = "full_scale"  # keyword of the text in a PNG file
 _LARGEST_RATIO = 1100  # of pixels to bytes of a PNG file; deflate reaches 1032
 _CHANNELS = {"1": 1, "L": 1, "I;16": 1, "P": 3, "RGB": 3, "LA": 4, "RGBA": 4}  # of decoded pixels, by mode
@@ -32,9 +35,15 @@ _LONGEST_HEADER = 2**24  # bytes before the pixels: EXIF data and previews have 
 _PNG_HEADER = 8 + 25  # bytes of the signature and the chunk with the size
 
 
-def image_info(path: Path) -> StackInfo:
-    """The stack of one frame in a PNG or JPEG file."""
-    is_png = path.suffix.lower() == ".png"
+def _open_image(path: Path) -> FrameReader:
+    """Open a PNG, JPEG or TIFF file of one frame."""
+    if path.suffix.lower() in _TIFF:
+        reader = open_tiff(path)
+        if reader.info.shape[0] != 1:
+            reader.close()
+            raise ValueError(f"{path}: expected one image per file, this file contains {reader.info.shape[0]}")
+        return reader
+    is_png = path.suffix.lower() in _PNG
     with readable_stack(path, "PNG" if is_png else "JPEG"), path.open("rb") as file:
         head = file.read(_LONGEST_HEADER)  # Pillow would search a file of any size for it, at 20 MB/s
         file_size = file.seek(0, io.SEEK_END)
@@ -52,33 +61,27 @@ def image_info(path: Path) -> StackInfo:
         if file_size > 4 * nbytes + _LONGEST_HEADER:
             raise ValueError(f"{file_size} bytes are too many for {size}")
         shape = (1, image.height, image.width) if channels == 1 else (1, channels, image.height, image.width)
-        stated, dpi, resolution = image.info.get(_FULL_SCALE), image.info.get("dpi"), None
-        if is_png and dpi is not None and min(dpi) > 0:
-            resolution = (round(dpi[0] / 0.0254) / 100.0, round(dpi[1] / 0.0254) / 100.0, "centimeter")
+        stated = image.info.get(_FULL_SCALE)
         full_scale = known_full_scale(dtype, None if stated is None else float(stated))
-        info = StackInfo(shape, dtype.name, full_scale, resolution=resolution, channels_last=channels > 1)
-        return replace(info, **exif_fields(image.info.get("exif", b"")))
+        info = StackInfo(shape, dtype.name, full_scale, **exif_fields(image.info.get("exif", b"")))
+    return FrameReader(path, info, lambda *_: _decoded(path, is_png).reshape(info.shape))
 
 
-def decode_image(path: Path) -> Array:
+def _decoded(path: Path, is_png: bool) -> Array:
     """Pixels of a PNG or JPEG file as stored, without its orientation: (H, W), or (C, H, W) in RGB or RGBA."""
-    is_png = path.suffix.lower() == ".png"
-    with readable_stack(path, "PNG" if is_png else "JPEG"):
-        data = path.read_bytes()
-        if is_png:
-            PngImageFile(io.BytesIO(data)).verify()  # checksums of all parts
-            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-            if pixels is None:
-                raise ValueError("its pixels cannot be decoded")
-        else:
-            pixels = np.asarray(JpegImageFile(io.BytesIO(data)))
-        if pixels.ndim == 2:
-            return pixels
-        return np.moveaxis(pixels[..., (2, 1, 0, 3)[: pixels.shape[-1]]] if is_png else pixels, -1, 0)
+    data = path.read_bytes()
+    if not is_png:
+        pixels = np.asarray(JpegImageFile(io.BytesIO(data)))
+        return pixels if pixels.ndim == 2 else np.moveaxis(pixels, -1, 0)
+    PngImageFile(io.BytesIO(data)).verify()  # checksums of all parts
+    stored = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if stored is None:
+        raise ValueError("its pixels cannot be decoded")
+    return stored if stored.ndim == 2 else np.moveaxis(stored[..., (2, 1, 0, 3)[: stored.shape[-1]]], -1, 0)
 
 
 def encode_png(path: Path, frame: Array, info: StackInfo) -> None:
-    """Write one frame (H, W) or (C, H, W), with full scale, resolution and orientation in chunks of their own."""
+    """Write one frame (H, W) or (C, H, W), with full scale and orientation in chunks of their own."""
     if frame.ndim == 3:
         frame = np.moveaxis(frame, 0, -1)[..., (2, 1, 0, 3)[: frame.shape[0]] if frame.shape[0] > 1 else (0,)]
     done, encoded = cv2.imencode(".png", np.ascontiguousarray(frame))
@@ -89,10 +92,6 @@ def encode_png(path: Path, frame: Array, info: StackInfo) -> None:
         file.write(data[:_PNG_HEADER])
         if info.full_scale is not None:
             putchunk(file, b"tEXt", f"{_FULL_SCALE}\0{info.full_scale:.17g}".encode())
-        if info.resolution is not None:
-            per_metre = 100.0 if info.resolution[2] == "centimeter" else 100.0 / 2.54
-            sizes = (round(value * per_metre).to_bytes(4, "big") for value in info.resolution[:2])
-            putchunk(file, b"pHYs", *sizes, b"\1")
         if info.orientation != 1:
             exif = Image.Exif()
             exif[ExifTags.Base.Orientation] = info.orientation
@@ -100,19 +99,18 @@ def encode_png(path: Path, frame: Array, info: StackInfo) -> None:
         file.write(data[_PNG_HEADER:])
 
 
-_PNG, _TIFF, _JPEG = (".png",), (".tif", ".tiff"), (".jpg", ".jpeg")
-_KINDS = {"PNG": _PNG, "TIFF": _TIFF, "JPEG": _JPEG}
-_ENDINGS = (*_PNG, *_TIFF, *_JPEG)
-_PNG_TYPES = ("uint8", "uint16")
+def _images_in(folder: Path) -> dict[str, list[Path]]:
+    """The images in a folder by their kind, without hidden files."""
+    files = [file for file in folder.iterdir() if not file.name.startswith(".") and file.is_file()]
+    kinds = {kind: [f for f in files if f.suffix.lower() in endings] for kind, endings in _KINDS.items()}
+    return {kind: images for kind, images in kinds.items() if images}
 
 
 def _frame_files(path: Path) -> list[Path]:
     """The files of a folder in natural order (frame9 before frame10), or one file."""
     if not path.is_dir():
         return [path]
-    visible = [file for file in path.iterdir() if not file.name.startswith(".") and file.is_file()]
-    files = {kind: [f for f in visible if f.suffix.lower() in endings] for kind, endings in _KINDS.items()}
-    found = [kind for kind in files if files[kind]]
+    found = _images_in(path)
     if len(found) > 1:
         raise ValueError(f"{path}: the folder contains both {' and '.join(found)} files; expected one kind")
     if not found:
@@ -122,80 +120,45 @@ def _frame_files(path: Path) -> list[Path]:
         split = re.split(r"(\d+)", file.name)
         return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in split if part]
 
-    return sorted(files[found[0]], key=parts)
+    return sorted(next(iter(found.values())), key=parts)
 
 
-def _frame_numbers(files: list[Path]) -> tuple[int, ...] | None:
-    """Number of frame intervals from the first file to each one, if the numbers in the names show that some are gone.
-
-    Names must differ in one number, whose most common step is its smallest, and divides all steps: frame_0, frame_1,
-    frame_3. Other names, e.g. with times in ms (frame_0, frame_33, frame_67), state nothing.
-    """
-    names = [re.split(r"(\d+)", file.stem) for file in files]
-    if len(files) < 3 or any(len(name) != len(names[0]) or name[::2] != names[0][::2] for name in names):
-        return None
-    numbers = np.array([[int(part) for part in name[1::2]] for name in names], dtype=object)
-    varying = [column for column in numbers.T if len(set(column)) > 1]
-    if len(varying) != 1:
-        return None
-    steps = np.diff(varying[0])
-    step = min(steps)
-    if step < 1 or np.median(steps.astype(float)) != step or any(steps % step) or all(steps == step):
-        return None
-    return tuple(int(number - varying[0][0]) // step for number in varying[0])
-
-
-def _read_info(file: Path) -> StackInfo:
-    if file.suffix.lower() not in _TIFF:
-        return image_info(file)
-    reader = open_tiff(file)
-    reader.close()
-    if reader.info.shape[0] != 1:
-        raise ValueError(f"{file}: expected one image per file, this file contains {reader.info.shape[0]}")
-    return reader.info
-
-
-def open_images(path: Path) -> BlockReader:
+def open_images(path: Path) -> FrameReader:
     """Open the files of a folder, or one file; frames are decoded on access."""
     files = _frame_files(path)
-    damaged: dict[int, ValueError] = {}
-    first: tuple[StackInfo, Path] | None = None
-    infos: list[StackInfo | None] = [None] * len(files)
-    for index, file in enumerate(files):
+    infos: dict[Path, StackInfo] = {}
+    damaged: dict[Path, ValueError] = {}
+    # 1. What each file states; all must be of one kind.
+    for file in files:
         try:
-            infos[index] = info = _read_info(file)
+            with closing(_open_image(file)) as reader:
+                infos[file] = info = replace(reader.info, frame_times=None)
         except ValueError as error:
-            damaged[index] = error
+            damaged[file] = error
             continue
-        if first is None:
-            first = (info, file)
-        if replace(info, resolution=first[0].resolution, frame_times=first[0].frame_times) != first[0]:
-            kinds = f"{first[1].name} is {first[0].kind}, {file.name} is {info.kind}"
+        first, stack = next(iter(infos.items()))
+        if info != stack:
+            kinds = f"{first.name} is {stack.kind}, {file.name} is {info.kind}"
             raise ValueError(f"frames of different size or kind: {kinds}")
-    if first is None or len(damaged) > len(files) // 2:
+    if len(damaged) > len(files) // 2 or not infos:
         raise next(iter(damaged.values()))
-    of_files = [info.metadata for info in infos if info is not None]
+    # 2. Metadata that are the same in all files.
+    of_files = [info.metadata for info in infos.values()]
     metadata: dict[str, Tag | None] = {}
     for name in dict.fromkeys(chain.from_iterable(of_files)):
         same = len({repr(tags.get(name, DIFFERENT)) for tags in of_files}) == 1  # arrays have no single equality
         metadata |= {name: of_files[0][name]} if same else {f"{name}{DIFFERENT}": None}
-    stack = replace(first[0], frame_times=None, metadata=metadata).with_frames(len(files))
-    if path.is_dir() and first[1].suffix.lower() in _TIFF:
+    stack = replace(stack, metadata=metadata).with_frames(len(files))
+    if path.is_dir() and files[0].suffix.lower() in _TIFF:
         stack = replace(stack, files=tuple(files))
 
     def read(index: int, _: int) -> Array:
-        try:
-            if index in damaged:
-                raise damaged[index]
-            if files[index].suffix.lower() not in _TIFF:
-                return decode_image(files[index]).reshape(1, *stack.shape[1:])
-            with closing(open_tiff(files[index])) as reader:
-                return reader.frame(0).reshape(1, *stack.shape[1:])
-        except ValueError as error:
-            message = str(error) if str(error).startswith(str(files[index])) else f"{files[index]}: {error}"
-            raise FrameError(message) from error
+        if files[index] in damaged:
+            raise FrameError(str(damaged[files[index]]))
+        with closing(_open_image(files[index])) as reader:
+            return reader.frame(0).reshape(1, *stack.shape[1:])
 
-    return BlockReader(path, replace(stack, frame_numbers=_frame_numbers(files), **merged_times(infos)), read)
+    return FrameReader(path, stack, read)
 
 
 def _ending(info: StackInfo) -> str:
@@ -218,10 +181,10 @@ def _write_file(file: Path, info: StackInfo, frame: Array, source: Path | None =
     storage: Table = {}
     with suppress(ValueError):  # a damaged file, whose frame is written as one without data
         if source is not None:
-            like, storage = _read_info(source), storage_of(source)
+            with closing(_open_image(source)) as reader:
+                like, storage = reader.info, storage_of(source)
             times = None if like.time_error else like.frame_times
-            one = replace(one, frame_times=times, metadata=like.metadata_for(one.shape, one.dtype))
-            one = replace(one, resolution=like.resolution)
+            one = replace(one, frame_times=times, metadata=like.with_shape(one.shape).metadata)
     write_tiff(file, one, iter([frame]), None, storage)
 
 
@@ -242,9 +205,8 @@ def check_images(path: Path, info: StackInfo) -> None:
     if path.suffix and info.shape[0] != 1:
         raise ValueError(f"{path}: a PNG file holds one frame, got {info.shape[0]}; write a folder")
     if path.is_dir():
-        images = {f.name for f in path.iterdir() if f.suffix.lower() in _ENDINGS and not f.name.startswith(".")}
-        others = images - set(_frame_names(info))
-        if others:
-            kind = next(kind for kind, endings in _KINDS.items() if Path(min(others)).suffix.lower() in endings)
-            found = f"other {kind} files, e.g. {min(others)}"
-            raise ValueError(f"{path}: the folder contains {found}; choose another folder")
+        for kind, files in _images_in(path).items():
+            others = {file.name for file in files} - set(_frame_names(info))
+            if others:
+                found = f"other {kind} files, e.g. {min(others)}"
+                raise ValueError(f"{path}: the folder contains {found}; choose another folder")

@@ -1,20 +1,17 @@
-"""What a file states about a stack: shape, data type, full scale, times, orientation; errors of unreadable files."""
+"""What a file states about a stack: shape, data type, full scale, times, orientation."""
 
 import math
 import re
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 
 from rsvib_torch.checks.arguments import check_fields, checked_methods
-from rsvib_torch.files.reading import Table
-from rsvib_torch.numerics.tables import Array
 from rsvib_torch.results.presentation import Summarised
-from rsvib_torch.text import one_line
 
 # Endings of videos: of those that are written with H.264 and FFV1, and of those that are only read.
 H264, FFV1 = (".mp4", ".mov", ".m4v"), (".mkv",)
@@ -24,11 +21,7 @@ VIDEO = (*FFV1, *H264, *READ_ONLY_VIDEO)
 DIFFERENT = " (differs between files)"  # ending of the names of metadata of a folder
 
 
-class FrameError(ValueError):
-    """One frame of a stack cannot be read; the other frames may be readable."""
-
-
-Scope = Literal["file", "image", "stack"]
+Scope = Literal["file", "image"]
 
 
 @dataclass(frozen=True)
@@ -40,9 +33,7 @@ class Tag:
     count: int  # number of values
     value: Any  # a number, text, bytes, or a tuple of numbers
     first_page: bool  # whether only the first page has it
-    # what it describes: ``"image"``: valid for frames of the same size only (georeferencing); ``"stack"``: for the same
-    # number of them in the same data type only; ``"file"``: for any frames
-    scope: Scope
+    scope: Scope  # for which frames it is valid: of the same size only (``"image"``, georeferencing), or for any
 
 
 @dataclass(frozen=True, repr=False)
@@ -57,15 +48,10 @@ class StackInfo(Summarised):
             floats, whose values are not scaled.
         frame_times: Exposure start of the first row of every frame in seconds, if the file states it.
         frame_rate: Frames per second, if the file states it instead of the times.
-        resolution: Pixels per unit along x and y, and the unit (``"inch"``, ``"centimeter"``), if the file states it.
-        channels_last: Whether the file stores the channels of a pixel next to each other.
         orientation: How the stored image is to be turned for display: 1 (as stored) to 8, the values of the tag of TIFF
             and EXIF, e.g. 6 for 90 degrees clockwise. Frames always have the stored rows and columns.
         time_error: Largest error of ``frame_times`` in seconds, e.g. rounding in a video; 0 if they are exact exposure
             starts. Times with an error may run at another rate than the exposures (``exposure_times``).
-        frame_numbers: Number of frame intervals from the first frame to each frame, if frames of a recording are
-            missing and the file states this instead of the times.
-        time_source: Where the file states times or frame rate, for messages.
         path: The file; None if the stack is not in a file, or has another number of frames than the file.
         metadata: Further metadata of a TIFF file by name, which are kept when it is restored to TIFF; None for those
             that cannot be kept.
@@ -88,14 +74,10 @@ class StackInfo(Summarised):
     dtype: str
     full_scale: float | None
     frame_times: tuple[float, ...] | None = None
-    resolution: tuple[float, float, str] | None = None
-    channels_last: bool = field(default=False, compare=False)
     frame_rate: float | None = None
     orientation: int = 1
     time_error: float = field(default=0.0, compare=False)
-    time_source: str = field(default="frame_times", compare=False)
     path: Path | None = field(default=None, compare=False)
-    frame_numbers: tuple[int, ...] | None = field(default=None, compare=False)
     metadata: Mapping[str, Tag | None] = field(default_factory=dict, compare=False, repr=False)
     decoding_bytes: int = field(default=0, compare=False)
     camera: str | None = field(default=None, compare=False)
@@ -116,7 +98,6 @@ class StackInfo(Summarised):
         parts += [] if self.frame_rate is None else [f"{self.frame_rate:.6g} frames per second"]
         if self.frame_times:
             parts.append(f"frame times {self.frame_times[0]:.6g} … {self.frame_times[-1]:.6g} s")
-        parts += [] if self.resolution is None else ["{:g} x {:g} px per {}".format(*self.resolution)]
         return ", ".join(parts)
 
     @property
@@ -130,19 +111,14 @@ class StackInfo(Summarised):
         return value if fits else None
 
     @property
+    def time_source(self) -> str:
+        """Where the file states times or frame rate, for messages."""
+        return "time stamps" if self.time_error else "frame_rate" if self.frame_times is None else "frame_times"
+
+    @property
     def axes(self) -> str:
         """``"THW"`` (grey) or ``"TCHW"``."""
         return "THW" if len(self.shape) == 3 else "TCHW"
-
-    @property
-    def stored_axes(self) -> str:
-        """Axes in the order of the file: ``"THW"``, ``"TCHW"`` or ``"THWC"``."""
-        return "THWC" if self.axes == "TCHW" and self.channels_last else self.axes
-
-    @property
-    def stored_shape(self) -> tuple[int, ...]:
-        """Shape in the order of the file."""
-        return tuple(self.shape[self.axes.index(axis)] for axis in self.stored_axes)
 
     @property
     def kind(self) -> str:
@@ -161,58 +137,23 @@ class StackInfo(Summarised):
         """Size of a frame in bytes."""
         return int(np.prod(self.shape[1:], dtype=object)) * np.dtype(self.dtype).itemsize
 
+    def with_shape(self, shape: tuple[int, ...]) -> "StackInfo":
+        """A stack of another shape: times and files belong to its number of frames, a georeference to their size."""
+        metadata = self.metadata
+        if shape[-2:] != self.shape[-2:]:
+            metadata = {name: None if tag is None or tag.scope == "image" else tag for name, tag in metadata.items()}
+        if shape[0] != self.shape[0]:
+            return replace(self, shape=shape, metadata=metadata, frame_times=None, path=None, files=None)
+        return replace(self, shape=shape, metadata=metadata)
+
     def with_frames(self, count: int) -> "StackInfo":
-        """The same kind of stack with ``count`` frames; times and path are kept only if their number is unchanged."""
-        if count == self.shape[0]:
-            return self
-        shape = (count, *self.shape[1:])
-        unknown: Table = dict.fromkeys(("frame_times", "frame_numbers", "path", "files"))
-        return replace(self, shape=shape, metadata=self.metadata_for(shape), **unknown)
+        """The same kind of stack with ``count`` frames."""
+        return self.with_shape((count, *self.shape[1:]))
 
     def restored_as(self, scale: int, mosaic: str | None) -> "StackInfo":
         """The kind of stack of the restored frames: ``scale`` times the rows and columns, colours of a mosaic."""
-        if scale == 1 and mosaic is None:
-            return self
         channels = self.shape[1:-2] if mosaic is None else (3,)
-        shape = (self.shape[0], *channels, scale * self.shape[-2], scale * self.shape[-1])
-        resolution = None
-        if self.resolution is not None:
-            x, y, unit = self.resolution
-            resolution = (scale * x, scale * y, unit)
-        return replace(self, shape=shape, path=None, resolution=resolution, metadata=self.metadata_for(shape))
-
-    def metadata_for(self, shape: tuple[int, ...], dtype: str | None = None) -> dict[str, Tag | None]:
-        """The metadata of a stack of another shape or data type: None for those that are not valid for it."""
-        invalid: set[Scope] = set()
-        if shape != self.shape or dtype not in (None, self.dtype):
-            invalid.add("stack")
-        if shape[-2:] != self.shape[-2:]:
-            invalid.add("image")
-        return {name: None if tag is None or tag.scope in invalid else tag for name, tag in self.metadata.items()}
-
-    def from_stored(self, frame: Array) -> Array:
-        """Convert a frame from the axis order and byte order of the file to (H, W) or (C, H, W) in native order."""
-        if self.stored_axes == "THWC":
-            frame = np.moveaxis(frame, -1, 0)
-        return frame.astype(frame.dtype.newbyteorder("="), copy=False)
-
-    def to_stored(self, frame: Array) -> Array:
-        """Convert a frame (H, W) or (C, H, W) to the axis order and data type of the file."""
-        if self.stored_axes == "THWC":
-            frame = np.moveaxis(frame, 0, -1)
-        return np.ascontiguousarray(frame, dtype=self.dtype)
-
-
-class FrameReader(Protocol):
-    """An open stack; frames are read one at a time, in any order."""
-
-    info: StackInfo
-
-    def frame(self, index: int) -> Array:
-        """Pixels of a frame as stored: (H, W) or (C, H, W), in ``info.dtype``; ``FrameError`` if it is damaged."""
-
-    def close(self) -> None:
-        """Close the file, if it is open between frames."""
+        return self.with_shape((self.shape[0], *channels, scale * self.shape[-2], scale * self.shape[-1]))
 
 
 _RANGE = re.compile(r"(.+)\[(\d*):(\d*)\]")
@@ -230,27 +171,3 @@ def split_range(path: Path) -> tuple[Path, tuple[int, int | None] | None]:
 def is_video(path: Path) -> bool:
     """Whether a stack, or frames of it, is a video by its name."""
     return split_range(path)[0].suffix.lower() in VIDEO
-
-
-@contextmanager
-def readable_stack(path: Path, kind: str) -> Iterator[None]:
-    """Convert any exception of a decoder of a ``kind`` of files into a ``ValueError``, except a missing permission."""
-    if not path.is_dir():
-        path.open("rb").close()
-    try:
-        yield
-    except MemoryError:
-        raise
-    except Exception as error:
-        raise ValueError(f"{path}: not a readable {kind} stack: {one_line(error)}") from error
-
-
-@contextmanager
-def readable_frame(path: Path, index: int) -> Iterator[None]:
-    """Convert any exception of a decoder into a one-line ``FrameError`` of frame ``index``."""
-    try:
-        yield
-    except (MemoryError, FrameError, FileNotFoundError):
-        raise
-    except Exception as error:
-        raise FrameError(f"{path}: frame {index} cannot be read: {one_line(error)}") from error

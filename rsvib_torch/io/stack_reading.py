@@ -16,11 +16,11 @@ from rsvib_torch.checks.arrays import PathLike
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.files.free_memory import check_fits
 from rsvib_torch.frames.loading import LoadedFrames
-from rsvib_torch.io.blocks import part_reader
 from rsvib_torch.io.formats import find_format
+from rsvib_torch.io.frame_reader import FrameReader, part_reader
 from rsvib_torch.io.frame_times import timing_from_first_frame
 from rsvib_torch.io.full_scale import counts_to_frames, full_scale_of_counts
-from rsvib_torch.io.stack_info import FrameReader, StackInfo, split_range
+from rsvib_torch.io.stack_info import StackInfo, split_range
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array
 
@@ -79,7 +79,7 @@ def read_stack(path: PathLike | Sequence[PathLike], *, full_scale: float | None 
     """Read a stack of frames from a file, or from several files one after another.
 
     The ending selects the format: TIFF (``.tif``, ``.tiff``; also BigTIFF and compressed), ``.npy`` with (H, W),
-    (T, H, W) or (T, C, H, W), HDF5 (``.h5``, ``.hdf5``), Zarr v3 (``.zarr``), raw frames with a sidecar (``.raw``),
+    (T, H, W) or (T, C, H, W), HDF5 (``.h5``, ``.hdf5``), Zarr v3 (``.zarr``),
     video (``.mp4``, ``.mov``, ``.mkv``, ``.avi`` and others; grey or RGB, with 8 to 16 bits), a single ``.png`` or
     ``.jpg``, or a folder of PNG, TIFF or JPEG files in natural order (frame9 before frame10). Channels keep the order
     of the file, RGB or RGBA. Frames have the stored rows and columns: an orientation that the file states for display

@@ -19,10 +19,8 @@ from rsvib_torch.numerics.tables import Array
 
 
 def stack_files(path: PathLike) -> list[Path]:
-    """The paths that a stack occupies: its file or folder, and the files beside it (sidecars)."""
-    path, _ = split_range(Path(path))
-    form = FORMATS.get(path.suffix.lower())
-    return [path, *(path.with_name(path.name + ending) for ending in (() if form is None else form.companions))]
+    """The file or folder of a stack, or of frames of it, for ``check_outputs``."""
+    return [split_range(Path(path))[0]]
 
 
 def check_info_target(
@@ -60,9 +58,9 @@ def _planned(shape: tuple[int, ...], dtype: str | None, full_scale: float | None
     info = StackInfo(tuple(shape), kind.name, full_scale)
     if like is None:
         return info
-    kept, metadata = like.with_frames(shape[0]), like.metadata_for(info.shape, info.dtype)
-    exact = replace(kept, frame_times=None if kept.time_error else kept.frame_times, time_error=0.0)
-    return replace(exact, shape=info.shape, dtype=info.dtype, full_scale=full_scale, metadata=metadata)
+    kept = like.with_shape(info.shape)
+    times = None if kept.time_error else kept.frame_times
+    return replace(kept, dtype=info.dtype, full_scale=full_scale, frame_times=times, time_error=0.0)
 
 
 def check_stack_target(
@@ -77,18 +75,16 @@ def check_stack_target(
     check_info_target(Path(path), _planned(shape, dtype, full_scale, like))
 
 
-def metadata_not_kept(
-    like: StackInfo, path: PathLike, shape: tuple[int, ...], *, dtype: str | None = None
-) -> tuple[str, ...]:
+def metadata_not_kept(like: StackInfo, path: PathLike, shape: tuple[int, ...]) -> tuple[str, ...]:
     """What a file states about its frames and the file ``path`` with the restored frames will not state.
 
-    ``shape`` is that of the restored frames, ``dtype`` their data type if it is another one. The result has names of
-    tags, ``"full scale"``, ``"resolution"``, ``"orientation"`` and ``"frame times"``.
+    ``shape`` is that of the restored frames. The result has names of tags, ``"full scale"``, ``"orientation"`` and
+    ``"frame times"``.
 
     Example:
-        >>> info = StackInfo((8, 1024, 1024), "uint16", 4095.0, resolution=(300.0, 300.0, "inch"))
+        >>> info = StackInfo((8, 1024, 1024), "uint16", 4095.0, orientation=6)
         >>> metadata_not_kept(info, "restored.npy", (8, 1024, 1024))
-        ('full scale', 'resolution')
+        ('full scale', 'orientation')
         >>> metadata_not_kept(info, "restored.tif", (8, 1024, 1024))
         ()
     """
@@ -98,10 +94,10 @@ def metadata_not_kept(
     keeps = FORMATS[".tif"].keeps if in_files else form.keeps
     stated = like.full_scale not in (None, known_full_scale(np.dtype(like.dtype)))
     timed = like.frame_times is not None and not like.time_error
-    lost = [name for name, tag in like.metadata_for(shape, dtype).items() if tag is None or "metadata" not in keeps]
+    lost = [name for name, tag in like.with_shape(shape).metadata.items() if tag is None or "metadata" not in keeps]
     if in_files and shape[-2:] == like.shape[-2:]:  # otherwise a georeference is lost
         lost = [name for name in lost if not name.endswith(DIFFERENT)]
-    others = {"full_scale": stated, "resolution": like.resolution is not None, "orientation": like.orientation != 1}
+    others = {"full_scale": stated, "orientation": like.orientation != 1}
     lost += [name.replace("_", " ") for name, has in others.items() if has and name not in keeps]
     lost += ["frame times"] * (timed and not ("frame_times" in keeps and shape[0] == like.shape[0]))
     return tuple(lost)
@@ -112,7 +108,7 @@ def write_frames(
 ) -> None:
     """Write a stack from its frames as stored; it gets its name when it is complete and on the disk."""
     assert form.write is not None
-    with whole(path, form.kind, form.companions) as part:
+    with whole(path, form.kind) as part:
         form.write(part, info, frames, compression)
 
 

@@ -1,55 +1,15 @@
-"""What attributes of this package and metadata of other programs (HDF5, Zarr, TIFF, EXIF) state about a stack.
+"""What attributes of arrays, descriptions of TIFF files, and EXIF metadata state about a stack."""
 
-Functions for other programs return the fields of ``StackInfo`` that the metadata state, and none if they are ambiguous
-or damaged, since frames can be read without them.
-"""
-
-from __future__ import annotations
-
-import math
-import re
-from collections.abc import Iterable
-from contextlib import suppress
-from datetime import UTC, datetime
-from itertools import pairwise
-from typing import TYPE_CHECKING, cast
-from xml.etree import ElementTree
+from pathlib import Path
 
 import numpy as np
 from PIL import ExifTags, Image
 
 from rsvib_torch.checks.arrays import channels_appear_last
 from rsvib_torch.files.reading import Table
-from rsvib_torch.io.full_scale import known_full_scale
+from rsvib_torch.io.full_scale import check_dtype, known_full_scale
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.text import one_line
-
-if TYPE_CHECKING:
-    import tifffile
-
-_SOFTWARE_CLOCK_ERROR = 5e-3  # s; times that acquisition software writes have jitter of milliseconds
-
-_SECONDS = {
-    **dict.fromkeys(("s", "sec", "second", "seconds"), 1.0),
-    **dict.fromkeys(("ms", "msec", "millisecond", "milliseconds"), 1e-3),
-    **dict.fromkeys(("us", "usec", "µs", "μs", "microsecond", "microseconds"), 1e-6),
-    **dict.fromkeys(("ns", "nsec", "nanosecond", "nanoseconds"), 1e-9),
-}
-_TIME_NAME = re.compile(r"(?:frame_?)?(?:time_?stamps?|times?)(?:_(s|sec|ms|us|ns))?", re.IGNORECASE)
-_RATE_NAME = re.compile(r"(?:acquisition_?)?frame_?rate(?:_hz)?|fps", re.IGNORECASE)
-_DESCRIBED_TIME = re.compile(
-    r"(?<!exposure )\b(?:frame_?|elapsed_?)?(?:time_?stamps?|times?)(?:[-_ ](?P<suffix>s|sec|ms|us|ns))?\"?\s*[=:]\s*"
-    r"(?P<value>[-+]?\d+(?:\.\d*)?(?:e[-+]?\d+)?)(?:\s*(?P<unit>s|sec|ms|us|µs|ns)\b)?",
-    re.IGNORECASE,
-)
-
-
-def _time_fields(times: Iterable[float | None], count: int, error: float, source: str) -> Table:
-    """Fields of ``count`` times in seconds; none unless all are known and strictly increasing."""
-    known = [time for time in times if time is not None and np.isfinite(time)]
-    if len(known) != count or any(later <= earlier for earlier, later in pairwise(known)):
-        return {}
-    return {"frame_times": tuple(known), "time_error": error, "time_source": source}
 
 
 def orientation_of(value: object) -> int:
@@ -64,190 +24,54 @@ def camera_name(make: object, model: object) -> str | None:
     return None if not name else name if repeated else f"{maker} {name}"
 
 
-def time_attributes(attributes: Table) -> Table:
-    """Those attributes whose names are used for times, their unit, and the frame rate."""
-    return {
-        name: value
-        for name, value in attributes.items()
-        if _TIME_NAME.fullmatch(re.sub("_units?$", "", name)) or _RATE_NAME.fullmatch(name)
-    }
-
-
-def times_of_attributes(attributes: Table, count: int) -> Table:
-    """Times of ``count`` frames, and frame rate, of HDF5 and Zarr attributes such as ``timestamps_ms``, ``frame_rate``.
-
-    The unit of times is that of the attribute with ``_unit`` or ``_units`` appended, or the ending of the name;
-    otherwise the one of s, ms, us and ns that gives 1 to 1000 frames per second. Other attributes are ignored.
-    """
-    fields: Table = {}
-    numbers = {name: np.asarray(value).ravel() for name, value in attributes.items()}
-    numbers = {name: stored for name, stored in numbers.items() if stored.dtype.kind in "iuf"}
-    for name, stored in numbers.items():
-        if _RATE_NAME.fullmatch(name) and len(stored) == 1 and 0.0 < float(stored[0]) < math.inf:
-            fields |= {"frame_rate": float(stored[0]), "time_source": f"attribute {name}"}
-    for name, stored in numbers.items():
-        match = _TIME_NAME.fullmatch(name)
-        if match is None or len(stored) != count or count < 2:
-            continue
-        # integers of 64 bits, e.g. nanoseconds since 1970, are subtracted before they are rounded to floats
-        relative = (stored - stored[0]).astype(np.float64) if stored[0] <= stored.min() else np.zeros(count)
-        unit = attributes.get(f"{name}_units", attributes.get(f"{name}_unit", match[1]))
-        if unit is None:
-            interval = float(np.median(np.diff(relative)))
-            factors = [factor for factor in (1.0, 1e-3, 1e-6, 1e-9) if 1e-3 <= factor * interval < 1.0]
-        else:
-            text = unit.decode() if isinstance(unit, bytes) else str(unit)
-            factors = [_SECONDS[text.lower()]] if text.lower() in _SECONDS else []
-        if len(factors) == 1:
-            error = max(factors[0] if stored.dtype.kind in "iu" else 0.0, 1e-9)
-            fields |= _time_fields((factors[0] * relative).tolist(), count, error, f"attribute {name}")
-    return fields
-
-
 def attributes_of(info: StackInfo) -> Table:
-    """Attributes of an HDF5 dataset or Zarr array that state ``info``; unknown values are omitted."""
-    times, resolution = info.frame_times, info.resolution
+    """Attributes of an array in a file, or keys of a TIFF description, that state ``info``, without unknown values."""
+    times = info.frame_times
     stated: Table = {
-        "axes": info.stored_axes,
         "full_scale": None if info.full_scale is None else float(info.full_scale),
         "frame_times": None if times is None else [float(time) for time in times],
         "frame_rate": None if times is not None or info.frame_rate is None else float(info.frame_rate),
         "orientation": None if info.orientation == 1 else info.orientation,
-        "resolution": None if resolution is None else [float(value) for value in resolution[:2]],
-        "resolution_unit": None if resolution is None else resolution[2],
     }
     return {name: value for name, value in stated.items() if value is not None}
 
 
-def info_from_attributes(attributes: Table, shape: tuple[int, ...], dtype: np.dtype) -> StackInfo:
-    """A stored array as a stack; the attributes are those of ``attributes_of``, or times of other programs."""
-    axes = str(attributes.get("axes", {2: "HW", 3: "THW", 4: "TCHW"}.get(len(shape), "")))
-    if len(axes) != len(shape) or axes not in ("HW", "THW", "TCHW", "THWC") or min(shape) < 1:
-        raise ValueError(f"array of shape {shape} with axes {axes!r}; expected HW, THW, TCHW or THWC")
-    if "axes" not in attributes and channels_appear_last(shape):
-        raise ValueError(
-            f"array of shape {shape} appears to have its channels last; store (T, C, H, W), or (T, H, W, C) with the "
-            "attribute axes='THWC'"
-        )
-    if axes == "HW":
-        shape = (1, *shape)
-    elif axes == "THWC":
-        shape = (shape[0], shape[3], shape[1], shape[2])
-    if attributes.get("frame_times") is not None:
-        stated: Table = {"frame_times": tuple(np.asarray(attributes["frame_times"], dtype=np.float64).ravel().tolist())}
-    else:
-        stated = times_of_attributes(attributes, shape[0])
-    resolution = attributes.get("resolution")
-    if resolution is not None:
-        x, y = (float(value) for value in resolution)
-        resolution = (x, y, str(attributes.get("resolution_unit", "centimeter")))
-    full_scale = attributes.get("full_scale")
-    return StackInfo(
-        shape,
-        dtype.name,
-        known_full_scale(dtype, None if full_scale is None else float(full_scale)),
-        resolution=resolution,
-        channels_last=axes == "THWC",
-        orientation=orientation_of(attributes.get("orientation")),
-        **stated,
-    )
+def fields_of_attributes(attributes: Table, count: int, dtype: np.dtype) -> Table:
+    """Fields of ``StackInfo`` of ``count`` frames that the attributes state, as ``attributes_of`` writes them."""
+    full_scale, rate = (attributes.get(name) for name in ("full_scale", "frame_rate"))
+    times = np.asarray(attributes.get("frame_times", ()), dtype=np.float64).ravel().tolist()
+    return {
+        "full_scale": known_full_scale(dtype, None if full_scale is None else float(full_scale)),
+        "frame_times": tuple(times) if len(times) == count else None,
+        "frame_rate": None if rate is None else float(np.asarray(rate).item()),
+        "orientation": orientation_of(attributes.get("orientation")),
+    }
 
 
-def _seconds_of_date(text: object, fraction: object = "") -> float | None:
-    """Seconds since 1970 of a date of TIFF and EXIF with a fraction of a second; None without a fraction."""
-    digits = str(fraction).strip("\0 ")
-    date = str(text).strip("\0 ")
-    if "." not in date and digits.isdecimal():
-        date = f"{date}.{digits}"
-    try:
-        moment = datetime.fromisoformat(date[:10].replace(":", "-") + date[10:26])
-    except ValueError:
-        return None
-    return moment.replace(tzinfo=UTC).timestamp() if "." in date else None
+def info_of_array(shape: tuple[int, ...], dtype: np.dtype, attributes: Table | None = None) -> StackInfo:
+    """An array (H, W), (T, H, W) or (T, C, H, W) in a file as a stack."""
+    check_dtype(dtype)
+    if len(shape) not in (2, 3, 4) or min(shape) < 1:
+        raise ValueError(f"array of shape {shape}; expected (H, W), (T, H, W) or (T, C, H, W)")
+    if channels_appear_last(shape):
+        raise ValueError(f"array of shape {shape} appears to have its channels last; store (T, C, H, W)")
+    stack = shape if len(shape) > 2 else (1, *shape)
+    return StackInfo(stack, dtype.name, **fields_of_attributes(attributes or {}, stack[0], dtype))
+
+
+def check_array(path: Path, info: StackInfo) -> None:
+    """Refuse a shape that would be read as another one."""
+    if channels_appear_last(info.shape):
+        raise ValueError(f"{path}: array of shape {info.shape} would be read as one with channels last; write .tif")
 
 
 def exif_fields(data: bytes) -> Table:
-    """Orientation, camera and time of one image from its EXIF metadata."""
+    """Orientation and camera of one image from its EXIF metadata."""
     exif = Image.Exif()
     try:
         exif.load(data)
-        details = exif.get_ifd(ExifTags.IFD.Exif)
     except Exception:  # damaged metadata raise errors of many types
         return {}
     tags = ExifTags.Base
-    taken = _seconds_of_date(details.get(tags.DateTimeOriginal), details.get(tags.SubsecTimeOriginal, ""))
-    changed = _seconds_of_date(exif.get(tags.DateTime), details.get(tags.SubsecTime, ""))
     camera = camera_name(exif.get(tags.Make), exif.get(tags.Model))
-    fields = {"orientation": orientation_of(exif.get(tags.Orientation)), "camera": camera}
-    return fields | _time_fields([changed if taken is None else taken], 1, _SOFTWARE_CLOCK_ERROR, "EXIF times")
-
-
-def merged_times(infos: Iterable[StackInfo | None]) -> Table:
-    """Times of a folder from the times of its files: the ``StackInfo`` of each, None for those that are damaged."""
-    infos = list(infos)
-    times = [info.frame_times[0] if info is not None and info.frame_times else None for info in infos]
-    return _time_fields(times, len(infos), _SOFTWARE_CLOCK_ERROR, infos[0].time_source if infos[0] else "")
-
-
-def _described_time(text: str) -> float | None:
-    """Time in seconds in the description of a page, e.g. ``frame_time_ms = 33.3`` or ``"ElapsedTime-ms": 33.3``."""
-    found = {
-        float(match["value"]) * _SECONDS[unit.lower()]
-        for match in _DESCRIBED_TIME.finditer(text)
-        if (unit := match["suffix"] or match["unit"])
-    }
-    return found.pop() if len(found) == 1 else None
-
-
-def _ome_fields(text: str, count: int) -> Table:
-    """Times of the planes (``DeltaT``) or their interval (``TimeIncrement``) in the OME-XML of an image."""
-    pixels = ElementTree.fromstring(text).find(".//{*}Pixels")
-    if pixels is None:
-        return {}
-    times: dict[int, float] = {}
-    for plane in pixels.iterfind("{*}Plane"):
-        unit = _SECONDS.get(plane.get("DeltaTUnit", "s").lower())
-        if plane.get("TheC", "0") == "0" and plane.get("DeltaT") is not None and unit is not None:
-            number = int(plane.get("TheT", "0")) + int(plane.get("TheZ", "0"))  # only one of them varies
-            times[number] = unit * float(plane.get("DeltaT", ""))
-    fields = _time_fields((times.get(i) for i in range(count)), count, _SOFTWARE_CLOCK_ERROR, "OME DeltaT")
-    interval = float(pixels.get("TimeIncrement", "0")) * _SECONDS.get(pixels.get("TimeIncrementUnit", "s").lower(), 0.0)
-    if not fields and interval > 0.0:
-        fields = {"frame_rate": 1.0 / interval, "time_source": "OME TimeIncrement"}
-    return fields
-
-
-def tiff_times(tif: tifffile.TiffFile, count: int, metadata: Table) -> Table:
-    """Times of ``count`` frames or frame rate of a TIFF file.
-
-    They are stated by the ``metadata`` that this package writes, OME-XML, ImageJ (``finterval``), or on every page by a
-    description with a time and its unit, or by the tag DateTime with a fraction of a second.
-    """
-    if len(metadata.get("frame_times", ())) == count:  # otherwise those of the first of several arrays
-        return {"frame_times": tuple(float(time) for time in metadata["frame_times"])}
-    if "frame_rate" in metadata:
-        return {"frame_rate": float(metadata["frame_rate"]), "time_source": "frame_rate"}
-    with suppress(Exception):  # damaged metadata raise errors of many types
-        if tif.ome_metadata:
-            return _ome_fields(tif.ome_metadata, count)
-        imagej = tif.imagej_metadata or {}
-        interval, unit = imagej.get("finterval"), _SECONDS.get(str(imagej.get("tunit", "s")).lower())
-        if isinstance(interval, int | float) and interval > 0:
-            return {"frame_rate": 1.0 / (unit * interval), "time_source": "ImageJ finterval"} if unit else {}
-        if len(tif.pages) == count and (first := _page_times(tif.pages.first)):
-            pages = (_page_times(cast("tifffile.TiffPage", tif.pages.get(n, aspage=True))) for n in range(count))
-            source = next(iter(first))
-            return _time_fields((page.get(source) for page in pages), count, _SOFTWARE_CLOCK_ERROR, source)
-    return {}
-
-
-def _page_times(page: tifffile.TiffPage) -> dict[str, float]:
-    """The time of a page by each source that states it."""
-    tags = page.tags
-    exif = tags.valueof("ExifTag", {})
-    times = {
-        "times in descriptions": _described_time(page.description),
-        "EXIF times": _seconds_of_date(exif.get("DateTimeOriginal"), exif.get("SubsecTimeOriginal", "")),
-        "DateTime tags": _seconds_of_date(tags.valueof("DateTime"), exif.get("SubsecTime", "")),
-    }
-    return {source: time for source, time in times.items() if time is not None}
+    return {"orientation": orientation_of(exif.get(tags.Orientation)), "camera": camera}

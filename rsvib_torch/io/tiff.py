@@ -7,8 +7,7 @@ those that are not are named, so that the user learns what is lost.
 import json
 import math
 import re
-import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -18,10 +17,10 @@ import numpy as np
 import tifffile
 
 from rsvib_torch.files.reading import Table
-from rsvib_torch.io.blocks import BlockReader, contiguous_reader
-from rsvib_torch.io.full_scale import check_dtype, known_full_scale
-from rsvib_torch.io.stack_info import FrameError, Scope, StackInfo, Tag, readable_stack
-from rsvib_torch.io.stated_metadata import attributes_of, orientation_of, tiff_times
+from rsvib_torch.io.frame_reader import FrameError, FrameReader, contiguous_reader, readable_stack
+from rsvib_torch.io.full_scale import check_dtype
+from rsvib_torch.io.stack_info import Scope, StackInfo, Tag
+from rsvib_torch.io.stated_metadata import attributes_of, fields_of_attributes
 from rsvib_torch.numerics.tables import Array
 
 _PHOTOMETRIC: tuple[int, ...] = (tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.RGB)
@@ -32,15 +31,21 @@ _LARGEST_RATIO = 5000  # of pixels to the size of the file; deflate reaches 1032
 class _Page(NamedTuple):
     """What the header of a page states."""
 
-    number: int  # in the file
-    kind: str  # size and type of the pixels, for messages and comparisons
-    nbytes: int  # of its decoded pixels
+    kind: str  # size and type of the pixels, for comparisons and messages
     complete: bool  # whether its stored pixels lie within the file
     secondary: bool  # whether it is a thumbnail or a mask of another page
 
 
 def _name(photometric: object) -> str:
     return getattr(photometric, "name", str(photometric))
+
+
+def _kind(page: tifffile.TiffPage) -> str:
+    """Size and type of the pixels of a page."""
+    height, width = page.shape[:2] if page.axes == "YXS" else page.shape[-2:]
+    channels = f", {page.samplesperpixel} channels," if len(page.shape) == 3 else ""
+    meaning = "" if page.photometric in _PHOTOMETRIC else f" {_name(page.photometric)}"
+    return f"{height} x {width} px{channels} {page.dtype}{meaning}"
 
 
 def _pages(tif: tifffile.TiffFile) -> list[_Page]:
@@ -50,19 +55,12 @@ def _pages(tif: tifffile.TiffFile) -> list[_Page]:
     """
     pages: list[_Page] = []
     visited: set[int] = set()
-    file, kinds = tif.filehandle, {}
+    file = tif.filehandle
     for page in cast(Iterable[tifffile.TiffPage], tif.pages):
         if page.offset in visited:
             raise ValueError("its chain of pages runs in a circle")
         visited.add(page.offset)
-        key = page.shape, page.axes, page.dtype, page.photometric
-        if key not in kinds:
-            shape = _with_channels_first(page.shape, page.axes)
-            channels = f", {shape[0]} channels," if len(shape) == 3 else ""
-            meaning = "" if page.photometric in _PHOTOMETRIC else f" {_name(page.photometric)}"
-            kinds[key] = f"{' x '.join(map(str, shape[-2:]))} px{channels} {page.dtype}{meaning}"
-        complete = _is_complete(page, file.size)
-        pages.append(_Page(len(pages), kinds[key], int(page.nbytes), complete, bool(page.subfiletype & 0b101)))
+        pages.append(_Page(_kind(page), _is_complete(page, file.size), bool(page.subfiletype & 0b101)))
     file.seek(tif.pages.next_page_offset or 0)
     if not pages or file.read(tif.tiff.offsetsize) != bytes(tif.tiff.offsetsize):
         raise ValueError(f"truncated: the header of page {len(pages)} lies beyond the end of the file")
@@ -73,50 +71,6 @@ def _is_complete(page: tifffile.TiffPage | tifffile.TiffFrame | None, size: int)
     """Whether the stored pixels of a page lie within a file of ``size`` bytes."""
     ends = [] if page is None else map(sum, zip(page.dataoffsets, page.databytecounts, strict=True))
     return max(ends, default=size + 1) <= size
-
-
-def _with_channels_first(shape: tuple[int, ...], axes: str) -> tuple[int, ...]:
-    """The shape of a page with channels before the image axes."""
-    return (shape[2], *shape[:2]) if axes == "YXS" else shape
-
-
-def _check_complete(complete: Sequence[bool], nbytes: int, size: int) -> None:
-    """Raise a ``ValueError`` if a file cannot hold the pixels, or more than half of the pages are incomplete."""
-    if nbytes > _LARGEST_RATIO * size:
-        raise ValueError(f"its header states {nbytes} bytes of pixels, which {size} bytes cannot hold")
-    if sum(complete) < 0.5 * len(complete):
-        raise ValueError(f"truncated: pixels of page {complete.index(False)} lie beyond the end of the file")
-
-
-def _resolution(tif: tifffile.TiffFile) -> tuple[float, float, str] | None:
-    """Pixels per unit, if the unit is one of length."""
-    tags = tif.pages.first.tags
-    unit = {2: "inch", 3: "centimeter"}.get(int(tags.valueof("ResolutionUnit", 0)))
-    (x, per_x), (y, per_y) = (tags.valueof(name, (0, 0)) for name in ("XResolution", "YResolution"))
-    return (x / per_x, y / per_y, unit) if unit is not None and min(x, per_x, y, per_y) > 0 else None
-
-
-def _info(
-    tif: tifffile.TiffFile, shape: tuple[int, ...], dtype: np.dtype, photometric: object, *, channels_last: bool
-) -> StackInfo:
-    """A stack of that shape, with what the first page states."""
-    if photometric not in _PHOTOMETRIC:
-        raise ValueError(f"pixels are {_name(photometric)}; expected grey (black is 0) or RGB")
-    check_dtype(dtype)
-    metadata, bits = _json_description(tif), tif.pages.first.bitspersample
-    full_scale = metadata.get("full_scale")
-    if full_scale is None and isinstance(bits, int) and bits not in (8, 16, 32, 64) and dtype.kind == "u":
-        full_scale = 2**bits - 1  # packed pixels, e.g. 4095 for 12 bits
-    info = StackInfo(
-        shape,
-        dtype.name,
-        known_full_scale(dtype, None if full_scale is None else float(full_scale)),
-        resolution=_resolution(tif),
-        channels_last=channels_last,
-        orientation=orientation_of(tif.pages.first.tags.valueof("Orientation")),
-        **tiff_times(tif, shape[0], metadata),
-    )
-    return replace(info, metadata=_metadata(tif, info))
 
 
 # programs that state how the pages of a file are arranged, as tifffile names them
@@ -151,7 +105,19 @@ def _series(tif: tifffile.TiffFile, count: int) -> tifffile.TiffPageSeries | Non
     return None
 
 
-def open_tiff(path: Path) -> BlockReader:
+def _info(tif: tifffile.TiffFile, shape: tuple[int, ...], dtype: np.dtype, photometric: object) -> StackInfo:
+    """A stack of that shape, with what the first page states."""
+    if photometric not in _PHOTOMETRIC:
+        raise ValueError(f"pixels are {_name(photometric)}; expected grey (black is 0) or RGB")
+    check_dtype(dtype)
+    metadata, bits = _json_description(tif), tif.pages.first.bitspersample
+    if isinstance(bits, int) and bits not in (8, 16, 32, 64) and dtype.kind == "u":
+        metadata = {"full_scale": 2**bits - 1, **metadata}  # packed pixels, e.g. 4095 for 12 bits
+    metadata["orientation"] = tif.pages.first.tags.valueof("Orientation")
+    return StackInfo(shape, dtype.name, metadata=_metadata(tif), **fields_of_attributes(metadata, shape[0], dtype))
+
+
+def open_tiff(path: Path) -> FrameReader:
     """Open a TIFF file of one or many pages."""
     with readable_stack(path, "TIFF"), ExitStack() as opened:
         tif = opened.enter_context(tifffile.TiffFile(path))
@@ -160,16 +126,16 @@ def open_tiff(path: Path) -> BlockReader:
         # 1. The array of the file. Without an arrangement, every page is a frame, thumbnails and masks excepted.
         pages, offset = (tif.pages, None) if series is None else (series.pages, series.dataoffset)
         if series is None:
-            frames = [page for page in headers if not page.secondary] or headers
-            numbers, complete = [page.number for page in frames], [page.complete for page in frames]
+            numbers = [number for number, page in enumerate(headers) if not page.secondary] or [*range(len(headers))]
+            complete = [headers[number].complete for number in numbers]
             first = cast(tifffile.TiffPage, pages[numbers[0]])
             if first.dtype is None or first.axes not in ("YX", "YXS", "SYX"):
                 raise ValueError(f"page {first.index} has shape {first.shape} (axes {first.axes}); expected an image")
-            other = next((page for page in frames if page.kind != frames[0].kind), None)
+            other = next((number for number in numbers if headers[number].kind != _kind(first)), None)
             if other is not None:
-                kinds = f"page {other.number} is {other.kind}, page {first.index} is {frames[0].kind}"
+                kinds = f"page {other} is {headers[other].kind}, page {first.index} is {_kind(first)}"
                 raise ValueError(f"frames of different size or kind: {kinds}")
-            axes, shape, dtype = f"T{first.axes}", (len(frames), *first.shape), first.dtype
+            axes, shape, dtype = f"T{first.axes}", (len(numbers), *first.shape), first.dtype
         else:
             first, axes, shape, dtype = series.keyframe, series.axes, series.shape, series.dtype
             numbers, complete = list(range(len(pages))), [_is_complete(page, size) for page in pages]
@@ -181,13 +147,18 @@ def open_tiff(path: Path) -> BlockReader:
             raise ValueError(f"axes {axes} of sizes {shape}; expected an axis of frames, one of channels, and YX")
         stack = shape if order["time"] else (1, *shape)
         stack = (stack[0], stack[3], *stack[1:3]) if order["last"] else stack
-        info = _info(tif, stack, dtype, first.photometric, channels_last=order["last"] is not None)
+        info, channels_last = _info(tif, stack, dtype, first.photometric), order["last"] is not None
         if series is None and len(numbers) < len(headers):
             info = replace(info, metadata={**info.metadata, "thumbnails and masks": None})
         # 3. Its frames: one after another, or in one or several pages.
         if offset is not None:
-            return contiguous_reader(path, info, offset, dtype.newbyteorder(tif.byteorder))
-        _check_complete(complete, info.shape[0] * info.frame_bytes, size)
+            stored_dtype = dtype.newbyteorder(tif.byteorder)
+            return contiguous_reader(path, info, offset, stored_dtype, channels_last=channels_last)
+        nbytes = info.shape[0] * info.frame_bytes
+        if nbytes > _LARGEST_RATIO * size:
+            raise ValueError(f"its header states {nbytes} bytes of pixels, which {size} bytes cannot hold")
+        if sum(complete) < 0.5 * len(complete):
+            raise ValueError(f"truncated: pixels of page {complete.index(False)} lie beyond the end of the file")
         over_pages = shape[: len(shape) - len(first.shape)]
         if math.prod(over_pages) != len(numbers) or (order["time"] and not over_pages):
             raise ValueError(f"axes {axes}: a page has several frames; expected one frame per page")
@@ -198,27 +169,25 @@ def open_tiff(path: Path) -> BlockReader:
             if not all(_is_complete(page, size) for page in of_frame):
                 raise FrameError(f"{path}: truncated: pixels of frame {first} lie beyond the end of the file")
             stored = np.stack([page.asarray(maxworkers=1) for page in of_frame if page is not None])
-            return (np.moveaxis(stored, -1, 1) if info.channels_last else stored).reshape(1, *info.shape[1:])
+            return (np.moveaxis(stored, -1, 1) if channels_last else stored).reshape(1, *info.shape[1:])
 
-        return BlockReader(path, info, read, close=opened.pop_all().close)
+        return FrameReader(path, info, read, close=opened.pop_all().close)
 
 
 # Metadata
 
-_DESCRIPTION, _IMAGEJ_COUNTS, _IMAGEJ = 270, 50838, 50839  # codes of tags
-_JSON = "JSON metadata"  # keys of the description that tifffile writes
-_RESOLUTION = "resolution"  # without a unit of length, which ImageJ states in the description
-# keys of that description for the reader only
-_LAYOUT_KEYS = ("shape", "axes", "truncated", "full_scale", "frame_times", "frame_rate")
-_IMAGEJ_KEY = "rsvib"  # of JSON in an ImageJ description: ImageJ uses the last description, so there is no other one
+_DESCRIPTION = 270  # code of a tag
+_RESOLUTION = {282, 283, 296}  # codes of x, y and unit; tifffile writes them by options
+# keys of the description as JSON, which are for the reader only
+_LAYOUT_KEYS = {"shape", "axes", "truncated", "full_scale", "frame_times", "frame_rate"}
 
 _OF_THE_FILE = (
-    "DocumentName Make Model DateTime Artist HostComputer XMP Copyright ExposureTime FNumber IPTCNAA InterColorProfile "
-    "GDAL_METADATA GDAL_NODATA GEO_METADATA"
+    "ImageDescription DocumentName Make Model DateTime Artist HostComputer XMP Copyright ExposureTime FNumber IPTCNAA "
+    "InterColorProfile GDAL_METADATA GDAL_NODATA GEO_METADATA"
 )
 _OF_THE_IMAGE = (
-    "ModelPixelScaleTag IntergraphMatrixTag ModelTiepointTag ModelTransformationTag GeoKeyDirectoryTag "
-    "GeoDoubleParamsTag GeoAsciiParamsTag RPCCoefficientTag"
+    "XResolution YResolution ResolutionUnit ModelPixelScaleTag IntergraphMatrixTag ModelTiepointTag "
+    "ModelTransformationTag GeoKeyDirectoryTag GeoDoubleParamsTag GeoAsciiParamsTag RPCCoefficientTag"
 )
 _COPIED: dict[int, Scope] = {
     **{tifffile.TIFF.TAGS[name]: "file" for name in _OF_THE_FILE.split()},
@@ -226,134 +195,59 @@ _COPIED: dict[int, Scope] = {
     **dict.fromkeys(range(65000, 65536), "file"),  # reusable range: values of the writing program
 }
 _FIRST_PRIVATE = 32768
-# Tags of stored pixels: all below the private range that are not copied, except references to other images; and these.
-_STORAGE = {32995, 32996, 32997, 32998, _IMAGEJ_COUNTS, _IMAGEJ}
+# Tags of stored pixels: all below the private range that are not copied, except references to other images; and these,
+# of which the last two belong to the description of ImageJ.
+_STORAGE = {32995, 32996, 32997, 32998, 50838, 50839}
 _SUBIFDS = 330
 
 
 def _json_description(tif: tifffile.TiffFile) -> Table:
     """What tifffile or this package states in the description of the first page; empty if there is nothing."""
-    return _parsed(tif.pages.first.shaped_description or str((tif.imagej_metadata or {}).get(_IMAGEJ_KEY, "")))
-
-
-def _parsed(text: str) -> Table:
     with suppress(ValueError):
-        values = json.loads(text)
+        values = json.loads(tif.pages.first.shaped_description or "")
         return values if isinstance(values, dict) else {}
     return {}
 
 
-def _metadata(tif: tifffile.TiffFile, info: StackInfo) -> dict[str, Tag | None]:
-    """Metadata of a TIFF file by name; None for those that cannot be copied to the file that this package writes.
-
-    Descriptions of the arrangement of its pages (OME, ImageJ) are copied only if those of the output will be the same.
-    """
+def _metadata(tif: tifffile.TiffFile) -> dict[str, Tag | None]:
+    """Metadata of a TIFF file by name; None for those that are not copied to the file that this package writes."""
     first = tif.pages.first
     numbers = sorted({1, len(tif.pages) - 1})  # a sample: values differ in all pages or in none
     others = [cast(tifffile.TiffPage, tif.pages.get(number)) for number in numbers if 0 < number < len(tif.pages)]
     found: dict[str, Tag | None] = {}
-
-    def add(name: str, values: Sequence[object], code: int, dtype: int, count: int, scope: Scope) -> None:
-        """Add the values of the first page and of the others, in which they may be missing."""
-        if any(value not in (None, values[0]) for value in values[1:]):
-            found[f"{name} (differs between pages)"] = None
-        else:
-            once = code == _DESCRIPTION or None in values[1:]
-            found[name] = None if values[0] is None else Tag(code, dtype, count, values[0], once, scope)
-
     for tag in first.tags:
         name = tag.name if not tag.name.isdecimal() else f"tag {tag.name}"
+        if tag.code in _RESOLUTION and _value(first, 282) in (None, (1, 1)):
+            continue  # not stated
         if tag.code in _COPIED:
-            values = [_value(page.tags.get(tag.code)) for page in (first, *others)]
-            add(name, values, tag.code, int(tag.dtype), tag.count, _COPIED[tag.code])
+            value, *rest = (_value(page, tag.code) for page in (first, *others))
+            if any(other not in (None, value) for other in rest):
+                found[f"{name} (differs between pages)"] = None
+            elif value is not None:
+                once = None in rest or tag.code == _DESCRIPTION
+                found[name] = Tag(tag.code, int(tag.dtype), tag.count, value, once, _COPIED[tag.code])
+            elif tag.code != _DESCRIPTION or tag.value not in ("", first.shaped_description):
+                found[name] = None
         elif (tag.code >= _FIRST_PRIVATE and tag.code not in _STORAGE) or tag.code == _SUBIFDS:
             found[name] = None
-    x, y, unit = (_value(first.tags.get(code)) for code in (282, 283, 296))
-    rational = all(isinstance(scale, tuple) and len(scale) == 2 and min(scale) > 0 for scale in (x, y))
-    if rational and unit == 1 and (x, y) != ((1, 1), (1, 1)):
-        found[_RESOLUTION] = Tag(282, 5, 2, (x, y), False, "image")
-    # Descriptions of all pages together are valid if the same pages will be written.
-    same = info.axes == "THW" or (info.channels_last and info.shape[1] in (3, 4))
-    stated, text = [_stated(page) for page in (first, *others)], _free_text(first)
-    if stated[0]:
-        add(_JSON, stated, _DESCRIPTION, 2, 0, "file")
-    imagej = dict(tif.imagej_metadata or {})
-    if imagej:
-        imagej.pop(_IMAGEJ_KEY, None)
-        imagej["axes"] = f"{'Z' if 'slices' in imagej else 'T'}YX" + "S" * (first.axes == "YXS")
-        dtypes = ("uint8", "uint16", "int16", "float32") if info.axes == "THW" else ("uint8",)  # of ImageJ
-        add("ImageJ metadata", [imagej if same and info.dtype in dtypes else None], _IMAGEJ, 1, 0, "stack")
-    elif first.is_ome:
-        single = same and info.shape[0] == len(tif.pages) and "FileName=" not in text
-        add("OME-XML", [text if single else None], _DESCRIPTION, 2, 0, "stack")
-    elif text:
-        add("ImageDescription", [text, *(_free_text(page) or None for page in others)], _DESCRIPTION, 2, 0, "file")
+    if not _json_description(tif).keys() <= _LAYOUT_KEYS:
+        found["JSON metadata"] = None
     return found
 
 
-def _value(tag: tifffile.TiffTag | None) -> Any:
-    """The value of a tag, None if it is missing, damaged or a structure of its own."""
+def _value(page: tifffile.TiffPage, code: int) -> Any:
+    """The value of a tag, None if it is missing, damaged, a structure of its own, or a description of pixels."""
+    if code == _DESCRIPTION:
+        texts = () if page.is_ome or page.is_imagej else (page.description, page.description1)
+        return next((text for text in texts if text and text != page.shaped_description), None)
     value = None
     with suppress(Exception):  # any type, from a damaged file
-        value = None if tag is None else tag.value
+        value = page.tags.valueof(code)
     parts = value if isinstance(value, tuple) else (value,)
     return value if all(isinstance(part, (int, float, str, bytes)) for part in parts) else None
 
 
-def _stated(page: tifffile.TiffPage) -> str | None:
-    """What the JSON description of a page states besides the layout; None if there is nothing."""
-    parsed = _parsed(page.shaped_description or "")
-    stated = {key: parsed[key] for key in sorted(parsed) if key not in _LAYOUT_KEYS}
-    return json.dumps(stated) if stated else None
-
-
-def _free_text(page: tifffile.TiffPage) -> str:
-    """The description of a page that is not that of tifffile."""
-    texts = (page.description, page.description1)
-    return next((text for text in texts if text and text != page.shaped_description), "")
-
-
-def _writer_options(info: StackInfo, description: Mapping[str, object]) -> Table:
-    """Options of ``tifffile.imwrite`` that store the metadata of a stack, and a description as JSON."""
-    extratags: list[tuple[object, ...]] = []
-    options: Table = {"metadata": dict(description), "extratags": extratags}
-    for name, tag in info.metadata.items():
-        if tag is None:
-            continue
-        if name == _JSON:
-            options["metadata"] = {**json.loads(tag.value), **options["metadata"]}
-        elif name == _RESOLUTION:
-            options.update(resolution=tag.value, resolutionunit="NONE")
-        elif tag.code == _IMAGEJ:
-            own = {key: value for key, value in description.items() if key != "axes"}
-            options.update(imagej=True, metadata={**tag.value, **({_IMAGEJ_KEY: json.dumps(own)} if own else {})})
-        elif tag.code == _DESCRIPTION:
-            options["description"] = tag.value.encode()
-        else:
-            value = tag.value.encode() if isinstance(tag.value, str) else tag.value
-            extratags.append((tag.code, tag.dtype, tag.count, value, tag.first_page))
-    return options
-
-
 # Writing
-
-
-def _layout(info: StackInfo) -> tuple[StackInfo, Table]:
-    """The stack as it is stored, and options of ``tifffile.imwrite``: three or four channels are stored last (RGB)."""
-    colour = info.axes == "TCHW" and info.shape[1] in (3, 4)
-    stored = replace(info, channels_last=colour)
-    axes = "TYX" if info.axes == "THW" else "TYXS" if colour else "TSYX" if info.shape[1] > 1 else "TCYX"
-    plain = replace(info, orientation=1, resolution=None)  # those are tags
-    description = {**attributes_of(plain), "axes": axes}
-    options = {"photometric": "rgb" if colour else "minisblack", **_writer_options(info, description)}
-    if axes == "TSYX":
-        options["planarconfig"] = "separate"
-    if info.orientation != 1:
-        options["extratags"].append(("Orientation", "H", 1, info.orientation, False))
-    if info.resolution is not None:
-        options["resolution"] = info.resolution[:2]
-        options["resolutionunit"] = info.resolution[2].upper()
-    return stored, {"shape": stored.stored_shape, "dtype": info.dtype, **options}
 
 
 def storage_of(path: Path) -> Table:
@@ -370,12 +264,30 @@ def write_tiff(
     path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None, storage: Mapping[str, object] = {}
 ) -> None:
     """Write a TIFF file frame by frame; arguments as in ``StackFormat.write``, and from ``storage_of``."""
-    stored, options = _layout(info)
-    pages = (stored.to_stored(frame) for frame in frames)
-    if stored.stored_axes == "TCHW":
+    # Three or four channels are stored last (RGB), others as planes of a page.
+    colour = info.axes == "TCHW" and info.shape[1] in (3, 4)
+    axes = "TYX" if info.axes == "THW" else "TYXS" if colour else "TSYX" if info.shape[1] > 1 else "TCYX"
+    # Metadata: full scale and times as JSON, all others as tags.
+    tags = {tag.code: tag for tag in info.metadata.values() if tag is not None}
+    extratags: list[tuple[object, ...]] = []
+    if info.orientation != 1:
+        extratags.append(("Orientation", "H", 1, info.orientation, False))
+    for tag in tags.values():
+        value = tag.value.encode() if isinstance(tag.value, str) else tag.value
+        if tag.code not in (_DESCRIPTION, *_RESOLUTION):
+            extratags.append((tag.code, tag.dtype, tag.count, value, tag.first_page))
+    options: Table = {"compression": compression, **storage, "extratags": extratags}
+    options["metadata"] = {**attributes_of(replace(info, orientation=1)), "axes": axes}
+    options |= {"photometric": "rgb" if colour else "minisblack"} | ({"planarconfig": 2} if axes == "TSYX" else {})
+    if _DESCRIPTION in tags:
+        options["description"] = tags[_DESCRIPTION].value.encode()
+    if tags.keys() >= _RESOLUTION:
+        x, y, unit = (tags[code].value for code in sorted(_RESOLUTION))
+        options |= {"resolution": (x, y), "resolutionunit": unit}
+    shape = (info.shape[0], *info.shape[2:], info.shape[1]) if colour else info.shape
+    pages = (np.ascontiguousarray(np.moveaxis(f, 0, -1) if colour else f, info.dtype) for f in frames)
+    if len(shape) == 4 and not colour and "tile" not in storage:
         pages = (plane for frame in pages for plane in frame)
     # an iterator would have to yield the tiles
-    data = np.stack(list(pages)).reshape(stored.stored_shape) if "tile" in storage else pages
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", ".* truncating ImageJ file")  # from 4 GB on, as ImageJ does: only one header
-        tifffile.imwrite(path, data=data, maxworkers=1, **{"compression": compression, **storage, **options})
+    data = np.stack(list(pages)) if "tile" in storage else pages
+    tifffile.imwrite(path, data=data, maxworkers=1, shape=shape, dtype=info.dtype, **options)

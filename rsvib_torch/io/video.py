@@ -21,7 +21,8 @@ import numpy as np
 
 from rsvib_torch.checks.values import needed_package
 from rsvib_torch.files.free_memory import check_fits
-from rsvib_torch.io.stack_info import H264, VIDEO, FrameError, StackInfo, readable_stack
+from rsvib_torch.io.frame_reader import FrameError, FrameReader, readable_stack
+from rsvib_torch.io.stack_info import H264, VIDEO, StackInfo
 from rsvib_torch.io.stated_metadata import camera_name
 from rsvib_torch.numerics.tables import Array
 
@@ -43,12 +44,6 @@ _MATRICES = {
     7: (0, -1, -1, 0), 8: (0, -1, 1, 0),
 }  # fmt: skip
 
-_GOPRO_FIRMWARE = {
-    "HD5.02": "GoPro HERO5 Black",
-    "HD5.03": "GoPro HERO5 Session",
-    "HD6.01": "GoPro HERO6 Black",
-    "HD7.01": "GoPro HERO7 Black",
-}  # the first characters of its version
 _FRAMES = 8  # decoded frames of a decoder; each has at most 6 bytes per pixel
 _av = partial(needed_package, "av", "reading and writing video", "video")
 
@@ -153,12 +148,12 @@ def _listed_times(container: InputContainer, stream: av.VideoStream) -> list[Fra
 
 
 def _camera(tags: dict[str, str]) -> str | None:
-    """Make and model of the camera in the tags of a video: QuickTime, Android, or the firmware of GoPro."""
+    """Make and model of the camera in the tags of a video: QuickTime or Android."""
     makes = ("com.apple.quicktime.make", "com.android.manufacturer", "make")
     for make, model in zip(makes, ("com.apple.quicktime.model", "com.android.model", "model"), strict=True):
         if tags.get(model):
             return camera_name(tags.get(make), tags[model])
-    return _GOPRO_FIRMWARE.get(tags.get("firmware", "")[:6])
+    return None
 
 
 @lru_cache(maxsize=8)
@@ -206,11 +201,9 @@ def _scan(path: Path, size: int, changed: int) -> tuple[StackInfo, tuple[Fractio
             pixels.dtype.name,
             _decoded_as(first.format)[1],
             tuple(float(time) for time in stated) if rising else None,
-            channels_last=pixels.ndim == 3,
             frame_rate=None if rising or not rate else float(rate),
             orientation=_orientation(first),
             time_error=float(unit),
-            time_source="time stamps",
             metadata={"subtitles": None} if container.streams.subtitles else {},
             camera=_camera(container.metadata | stream.metadata),
         )
@@ -228,13 +221,13 @@ def scanned(path: Path) -> tuple[StackInfo, tuple[Fraction, ...], Picture]:
             raise ValueError(error.strerror) from error
 
 
-class VideoReader:
+class VideoReader(FrameReader):
     """Frames of a video, decoded in sequence; reading an earlier frame starts again at the beginning."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self._next = path, 0
-        self.info, self._times, self.picture = scanned(path)
-        self._presented = self._in_order()
+        info, self._times, self.picture = scanned(path)
+        super().__init__(path, info, lambda index, _: _pixels(self._decoded(index))[None])
+        self._next, self._presented = 0, self._in_order()
 
     def _in_order(self) -> Generator[av.VideoFrame | None, None, None]:
         """The frames in their order, each at its presentation time if they are known; None if it cannot be decoded."""
@@ -250,10 +243,6 @@ class VideoReader:
                 else:
                     yield frame
                     frame = next(decoded, None)
-
-    def frame(self, index: int) -> Array:
-        """Pixels of a frame as stored."""
-        return _pixels(self._decoded(index))
 
     def planes(self, index: int) -> Array:
         """Planes of a frame in 8 bits, (3 H / 2, W), Y above U and V; chroma keeps its resolution.

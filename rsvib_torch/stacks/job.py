@@ -20,9 +20,10 @@ from rsvib_torch.files.reading import Table
 from rsvib_torch.frames.mosaic import check_mosaic, colour_frames
 from rsvib_torch.frames.pixels import enlarged
 from rsvib_torch.io import full_scale as scales
+from rsvib_torch.io.frame_reader import FrameError, FrameReader
 from rsvib_torch.io.frame_times import exposure_times, timing_of_stack
 from rsvib_torch.io.full_scale import counts_to_frames
-from rsvib_torch.io.stack_info import FrameError, FrameReader, StackInfo
+from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.io.stack_reading import open_stack, read_stack_info
 from rsvib_torch.motion.detected_vibration import DetectedVibration, FollowedVibration
 from rsvib_torch.motion.spline import FreeMotion

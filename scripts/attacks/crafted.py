@@ -85,25 +85,6 @@ _case_of("npy: header of 4 GB", b"\x93NUMPY\x02\x00" + struct.pack("<I", 2**32 -
 CASES["npy: sparse file of 64 GB"] = partial(_sparse, "a.npy", _npy("(8, 65536, 65536)"), 2**36 + 1000)
 CASES["npy: 10^8 frames of one pixel"] = partial(_sparse, "a.npy", _npy("(100000000, 1, 1)"), 2 * 10**8 + 1000)
 
-# --- raw ----------------------------------------------------------------------------------------------------------
-
-
-def _raw(folder: Path, *, size: int = 1000, **keys: object) -> Path:
-    content: dict[str, object] = {"format": "rsvib raw", "version": 1, "shape": [2, 16, 16], "axes": "THW"}
-    content |= {"dtype": "uint16"} | keys
-    _data("a.raw.json", json.dumps(content), folder)
-    return _sparse("a.raw", b"", size, folder)
-
-
-for _sizes in ([10**9, 64, 64], [10**400, 2, 2], [-1, 8, 8], [2] * 1000):
-    CASES[f"raw: shape {str(_sizes)[:30]}"] = partial(_raw, shape=_sizes)
-for _offset in (2**32 - 1, 2**64 - 1):
-    CASES[f"raw: offset {_offset}"] = partial(_raw, offset=_offset)
-CASES["raw: 10^6 frame times"] = partial(_raw, frame_times=[0.1 * i for i in range(10**6)])
-CASES["raw: sparse file of 64 GB"] = partial(_raw, size=2**36, shape=[8, 65536, 65536])
-CASES["raw: sidecar nested"] = lambda folder: (_raw(folder), _data("a.raw.json", "[" * _DEEP, folder))[0]
-CASES["raw: sidecar of 2 GB"] = lambda folder: (_raw(folder), _sparse("a.raw.json", b"{", 2 * 10**9, folder))[0]
-
 # --- PNG and JPEG -------------------------------------------------------------------------------------------------
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -418,7 +399,7 @@ CASES["video: zeros after a header of .ts"] = partial(_sparse, "a.mts", b"G" + b
 # --- Pipes, devices, links ----------------------------------------------------------------------------------------
 
 
-for _ending in (".tif", ".png", ".npy", ".h5", ".raw", ".mp4", ".toml", ".csv", ".vibration.json"):
+for _ending in (".tif", ".png", ".npy", ".h5", ".mp4", ".toml", ".csv", ".vibration.json"):
     for _name, _target in (("pipe", ""), ("device", "/dev/urandom")):
         CASES[f"{_name} {_ending}"] = partial(_special, f"a{_ending}", _target)
 

@@ -1,6 +1,5 @@
 """Stacks of a small vibrating camera, and functions that write them in layouts of other programs."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -59,10 +58,3 @@ def write_zarr(path: Path, counts: Counts, **options: Any) -> None:
     array = zarr.create_array(path, shape=counts.shape, dtype=counts.dtype, **options)
     array.attrs["full_scale"] = float(FULL_SCALE)
     array[:] = counts
-
-
-def write_raw(path: Path, counts: Counts, **keys: Any) -> None:
-    """Write raw counts and the file that describes them."""
-    counts.tofile(path)
-    described = {"format": "rsvib raw", "version": 1, "shape": counts.shape, "axes": "THW", "dtype": "uint16", **keys}
-    path.with_name(f"{path.name}.json").write_text(json.dumps(described), encoding="utf-8")

@@ -30,7 +30,7 @@ def _write_originals(folder: Path, source: Path) -> None:
     """Inputs of all kinds."""
     folder.mkdir()
     counts = tifffile.imread(source)[:4]
-    for name in ("frames.tif", "pngs", "frames.zarr", "frames.raw", "frames.npy", "frames.h5", "frames.mkv"):
+    for name in ("frames.tif", "pngs", "frames.zarr", "frames.npy", "frames.h5", "frames.mkv"):
         write_stack(folder / name, counts)
     write_stack(folder / "scene.png", counts[:1])
     (folder / "camera.toml").write_text(CAMERA + _SIMULATION)
@@ -79,7 +79,7 @@ def _attempts(place: Path) -> Iterator[tuple[str, Callable[..., None], tuple[obj
     def command(title: str, *arguments: object) -> tuple[str, Callable[..., None], tuple[object, ...]]:
         return title, _command, ([str(argument) for argument in arguments],)
 
-    stacks = ("frames.tif", "pngs", "frames.zarr", "frames.raw", "frames.npy", "frames.h5", "frames.mkv")
+    stacks = ("frames.tif", "pngs", "frames.zarr", "frames.npy", "frames.h5", "frames.mkv")
     for stack in stacks:
         source = place / stack
         for alias, output in _aliases(source).items():
@@ -93,7 +93,7 @@ def _attempts(place: Path) -> Iterator[tuple[str, Callable[..., None], tuple[obj
         yield command(f"detect pngs: {alias}", "detect", place / "pngs", "--out", out, *config)
         yield command(f"detect in windows: {alias}", "detect", place / "pngs", "--out", out, "--window", 3, *config)
         yield command(f"report pngs: {alias}", "report", place / "pngs", out, *config)
-    for stack in ("frames.tif", "frames.npy", "frames.raw", "frames.mkv"):
+    for stack in ("frames.tif", "frames.npy", "frames.mkv"):
         arguments = (place / stack, place, "--output", stack, *config)
         yield command(f"run {stack}: --output is the input", "run", *arguments)
     for alias, output in _aliases(place / "scene.png").items():
@@ -115,8 +115,6 @@ def _attempts(place: Path) -> Iterator[tuple[str, Callable[..., None], tuple[obj
     for manifest in ("frames.tif", "restored.tif", "pngs/manifest.json"):
         source = place / ("pngs" if manifest.startswith("pngs") else "frames.tif")
         yield f"process_stack: manifest {manifest}", _processed, (source, place / "restored.tif", place / manifest)
-    beside = (place / "frames.raw", place / "frames.raw.json")
-    yield command("motion: sidecar of the input", "motion", beside[0], "--out", beside[1], *config)
     (place / "tree.zarr").mkdir()
     shutil.copy(place / "frames.zarr" / "zarr.json", place / "tree.zarr")
     shutil.copy(place / "frames.tif", place / "tree.zarr")

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import tifffile
-from attacks.files import Counts, vibrating_counts, write_hdf5, write_raw, write_stack, write_tiff, write_zarr
+from attacks.files import Counts, vibrating_counts, write_hdf5, write_stack, write_tiff, write_zarr
 from attacks.trial import Trial, outcome_of_command, rsvib, run_watched
 
 import rsvib_torch as rsv
@@ -45,7 +45,6 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path, Counts], None]]] = {
     "Zarr, chunk per frame": ("l.zarr", partial(write_zarr, chunks=_FRAME)),
     "Zarr, one chunk": ("m.zarr", partial(write_zarr, chunks=_STACK)),
     "Zarr, sharded": ("n.zarr", partial(write_zarr, chunks=_FRAME, shards=_STACK)),
-    "raw": ("o.raw", write_raw),
     "PNG folder": ("p", write_stack),
     "video": ("q.mkv", write_stack),
 }

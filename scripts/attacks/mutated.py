@@ -18,7 +18,6 @@ from attacks.files import (
     FULL_SCALE,
     vibrating_counts,
     write_hdf5,
-    write_raw,
     write_stack,
     write_tiff,
     write_zarr,
@@ -77,13 +76,12 @@ def _read_manifest(path: Path) -> None:
 
 
 _STACKS = ("pages.tif", "packed.tif", "tiles.tif", "own.tif", "frames.npy", "frames.png", "colour.png", "frames.jpg")
-_STACKS += ("plain.h5", "packed.h5", "frames.raw", "frames.mkv", "frames.mp4")
+_STACKS += ("plain.h5", "packed.h5", "frames.mkv", "frames.mp4")
 _TEXTS = (".json", ".toml", ".csv", ".gcsv")  # endings of files of text
 # Files to damage, or members of what is read, and how it is read.
 ORIGINALS: dict[str, Callable[[Path], Any]] = {
     **dict.fromkeys(_STACKS, _read_stack),
     **dict.fromkeys(("pngs/frame_0001.png", "frames.zarr/zarr.json", "frames.zarr/c/1/0/0"), _read_stack),
-    "frames.raw.json": lambda path: _read_stack(path.with_suffix("")),
     "camera.toml": read_config,
     "motion.csv": lambda path: str(rsv.read_motion(path, unit="px")),
     "clip.gcsv": lambda path: str(rsv.read_gyroscope(path)),
@@ -118,7 +116,6 @@ def write_originals(folder: Path) -> dict[str, bytes]:
     cv2.imwrite(str(folder / "frames.jpg"), colour)
     write_hdf5(folder / "plain.h5", counts)
     write_hdf5(folder / "packed.h5", counts, chunks=(1, 96, 64), compression="gzip")
-    write_raw(folder / "frames.raw", counts, offset=0, full_scale=FULL_SCALE, frame_times=[0.0, 0.1, 0.2, 0.3])
     write_zarr(folder / "frames.zarr", counts, chunks=(1, 96, 64))
     (folder / "camera.toml").write_text(CONFIG)
     options: dict[str, Any] = {"window": 3, "detection": DETECTION, "restoration": {"method": "dewarp"}, "workers": 1}

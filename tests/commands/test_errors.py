@@ -11,7 +11,7 @@ from small_stack import CONFIG, TIMING, write_small
 from rsvib_torch import process_stack
 from rsvib_torch.commands.shared_options import check_new
 from rsvib_torch.commands.terminal import current_output, running
-from rsvib_torch.io import StackFormat, formats
+from rsvib_torch.io import formats
 from rsvib_torch.text import printable
 
 ONE_WINDOW = CONFIG.partition("[stack]")[0]
@@ -35,7 +35,7 @@ def failing(tmp_path, monkeypatch):
                 warnings.warn(warning, UserWarning, stacklevel=1)
             raise error
 
-        monkeypatch.setitem(formats.FORMATS, ".fail", StackFormat("failing", (".fail",), fail))
+        monkeypatch.setitem(formats.FORMATS, ".fail", formats.StackFormat("failing", (".fail",), fail))
         (tmp_path / "frames.fail").write_bytes(b"")
         return tmp_path / "frames.fail"
 

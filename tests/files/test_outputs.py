@@ -78,9 +78,7 @@ def test_outputs_must_differ(place):
             check_outputs([one, other], [])
 
 
-@pytest.mark.parametrize(
-    ("name", "linked"), [("out.tif", True), ("out.zarr", False), ("out", True), ("out.raw", False)]
-)
+@pytest.mark.parametrize(("name", "linked"), [("out.tif", True), ("out.zarr", False), ("out", True)])
 def test_pipes_are_not_replaced(tmp_path, name, linked):
     """A device or pipe in the place of an output stays as it is, and nothing is added to its folder."""
     source, pipe, output = tmp_path / "frames.tif", tmp_path / "pipe", tmp_path / "place" / name

@@ -74,7 +74,7 @@ def test_gopro_times_are_those_of_the_video(tmp_path):
         (lambda path: gcsv(path, rows=["0,1,2,3", "5,x,2,3"]), "line 9: gx must be a number, got 'x'"),
         (lambda path: gcsv(path, orientation="XXZ"), "orientation must have x, y and z once each"),
         (lambda path: path.write_text("time,gx,gy,gz\n" + "0,0,0,0\n" * 5), "the unit of the rates is not stated"),
-        (lambda path: path.write_text("time,gx,rate_x,gy,gz\n"), "could both be x"),
+        (lambda path: path.write_text("time,gx,rate_x,gy,gz\n"), "2 columns of the rate about x"),
         (lambda path: path.write_text("time,x_dps,y_dps,z_dps\n" + "7" * 200_000), "a line of more than 65536"),
         (
             lambda path: path.write_text("t,x_dps,y_dps,z_dps\n" + "1,0,0,0\n" * 5),
@@ -99,7 +99,7 @@ def test_damaged_files_are_refused_in_one_line(tmp_path, write, message):
     ("columns", "row", "message"),
     [
         ("time,x,y,z", "{0},1,0,1,0,2,0,3", r"line 2: 8 values in 4 columns; write decimal points, not commas"),
-        ("time,x,y,z,x", "{0},1,2,3,4", "column 'x' occurs twice|could both be x"),
+        ("time,x,y,z,x", "{0},1,2,3,4", "column 'x' occurs twice|2 columns of the rate about x"),
     ],
 )
 def test_decimal_commas_and_repeated_columns_are_refused(tmp_path, columns, row, message):

@@ -9,7 +9,7 @@ from refusals import refuses
 from test_tiff_pages import check_frames
 
 from rsvib_torch.io import open_stack
-from rsvib_torch.io.stack_info import FrameError
+from rsvib_torch.io.frame_reader import FrameError
 
 T, H, W = 20, 24, 40
 COUNTS = np.random.default_rng(7).integers(0, 4096, (T, H, W)).astype(np.uint16)
@@ -63,13 +63,6 @@ def test_frames_that_are_stored_alone_need_no_block(tmp_path, chunks):
 def test_sharded_zarr_is_decoded_frame_by_frame(tmp_path):
     write_zarr(tmp_path / "a.zarr", chunks=(1, H, W), shards=(T, H, W))
     assert check_frames(tmp_path / "a.zarr", COUNTS).decoding_bytes < 4 * COUNTS[0].nbytes
-
-
-def test_channels_last_in_chunks_of_several_frames(tmp_path):
-    write_hdf5(tmp_path / "a.h5", np.moveaxis(COLOUR, 1, -1), chunks=(5, H, W, 3), compression="gzip")
-    with h5py.File(tmp_path / "a.h5", "r+") as file:
-        file["frames"].attrs["axes"] = "THWC"
-    check_frames(tmp_path / "a.h5", COLOUR)
 
 
 @pytest.mark.parametrize(("axes", "compression"), [("TCYX", None), ("TCYX", "zlib"), ("TYX", "zlib")])

@@ -91,7 +91,7 @@ def test_npy_damage_is_refused(tmp_path):
     np.save(path, np.array([{"a": 1}], dtype=object), allow_pickle=True)
     refuses(lambda: read_stack(path), "pixels are object")
     np.save(path, np.asfortranarray(np.arange(189, dtype=np.uint8).reshape(3, 9, 7)))
-    assert (255 * read_stack(path)).round().flatten().tolist() == list(range(189))
+    refuses(lambda: read_stack(path), r"store numpy\.ascontiguousarray")
     for shape, message in (
         ((5,), "expected"),
         ((2, 9, 7, 3), r"channels last; store \(T, C, H, W\)"),

@@ -16,12 +16,10 @@ from test_tiff_pages import check_frames
 import rsvib_torch as rsv
 from rsvib_torch.io import (
     FrameError,
-    StackFormat,
     StackInfo,
     open_stack,
     read_stack,
     read_stack_info,
-    register_format,
     write_stack,
 )
 
@@ -62,7 +60,6 @@ READERS = {
     "a.tif": tifffile.imread,
     "a.h5": values_in_hdf5,
     "a.zarr": values_in_zarr,
-    "a.raw": lambda path: np.fromfile(path, read_stack_info(path).dtype),
 }
 
 
@@ -84,7 +81,7 @@ def test_stacks_are_read_as_written_also_by_other_libraries(tmp_path, name, shap
     assert found.dtype == dtype
     last = len(shape) == 4 and shape[1] in (3, 4) and name in ("frames", "a.tif")
     np.testing.assert_array_equal((np.moveaxis(found, -1, -3) if last else found).reshape(shape), stored)
-    assert {item.name for item in tmp_path.iterdir()} <= {name, "a.raw.json"}
+    assert {item.name for item in tmp_path.iterdir()} <= {name}
     if name == "frames":
         assert sorted(item.name for item in path.iterdir()) == [f"frame_{i:04d}.png" for i in range(shape[0])]
     write_stack(path, frames, dtype=dtype, full_scale=largest)  # the same counts again
@@ -104,7 +101,7 @@ def test_npy_and_single_png(tmp_path):
 
 
 @pytest.mark.parametrize("dtype", ["float16", "float32", "float64"])
-@pytest.mark.parametrize("ending", [".tif", ".npy", ".h5", ".zarr", ".raw"])
+@pytest.mark.parametrize("ending", [".tif", ".npy", ".h5", ".zarr"])
 def test_floats_keep_their_values_also_nan_and_infinity(tmp_path, dtype, ending):
     frames = torch.tensor([[[0.5, -2.0], [1e4, 0.25]], [[np.nan, np.inf], [0.0, 1.0]]])
     path = tmp_path / f"frames{ending}"
@@ -178,11 +175,6 @@ def test_folder_of_float_frames_contains_tiff_files(tmp_path):
     write_stack(tmp_path / "frames", torch.from_numpy(COUNTS / 4095.0))
     assert sorted(file.name for file in (tmp_path / "frames").iterdir()) == [f"frame_000{i}.tif" for i in range(3)]
     np.testing.assert_allclose(read_stack(tmp_path / "frames").numpy(), COUNTS / 4095, rtol=1e-6)
-
-
-@pytest.mark.parametrize(("ending", "message"), [(".TOY", "endings must be like '.tif'"), (None, "has no file ending")])
-def test_format_without_a_valid_ending_is_refused(ending, message):
-    refuses(lambda: register_format(StackFormat("toy", () if ending is None else (ending,), object)), message)
 
 
 @pytest.mark.parametrize(

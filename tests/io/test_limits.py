@@ -2,7 +2,6 @@
 
 import resource
 
-import h5py
 import numpy as np
 import pytest
 import torch
@@ -15,17 +14,6 @@ from rsvib_torch.io import read_stack, read_stack_info
 
 TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=104)
 COUNTS = np.random.default_rng(2).integers(0, 4096, (4, 16, 16)).astype(np.uint16)
-
-
-def test_hdf5_times_of_other_files_are_not_read(tmp_path):
-    with h5py.File(tmp_path / "times.h5", "w") as file:
-        file["timestamps"] = [0.0, 0.1, 0.2, 0.3]
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file["frames"] = COUNTS
-        layout = h5py.VirtualLayout(shape=(4,), dtype="f8")
-        layout[:] = h5py.VirtualSource(str(tmp_path / "times.h5"), "timestamps", shape=(4,))
-        file.create_virtual_dataset("timestamps", layout)
-    assert read_stack_info(tmp_path / "a.h5").frame_times is None
 
 
 @pytest.mark.parametrize("several", [False, True])
@@ -58,7 +46,7 @@ def test_a_full_disk_is_named_with_the_output(tmp_path):
             path, vibration.with_camera(rsv.Camera(900.0)), TIMING, size=(64, 64), num_frames=9
         ),
     }
-    for name in ("a.h5", "a.tif", "a.npy", "a.raw", "a.zarr"):
+    for name in ("a.h5", "a.tif", "a.npy", "a.zarr"):
         writers[name] = lambda path: rsv.write_stack(path, frames)
     resource.setrlimit(resource.RLIMIT_FSIZE, (300, before[1]))
     try:

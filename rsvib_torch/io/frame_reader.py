@@ -1,17 +1,23 @@
-"""The reader of stacks whose frames can be read in any order, alone or, where they are stored together, in blocks."""
+"""An open stack, whose frames are read in any order, alone or, where they are stored together, in blocks."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from rsvib_torch.io.stack_info import FrameError, FrameReader, StackInfo, readable_frame
+from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.numerics.tables import Array
+from rsvib_torch.text import one_line
 
 
-class BlockReader(FrameReader):
+class FrameError(ValueError):
+    """One frame of a stack cannot be read; the other frames may be readable."""
+
+
+class FrameReader:
     """Frames that are read in blocks of a number of frames ``together``; a block is kept until its last frame was read.
 
     ``read(first, last)`` returns frames ``first`` to ``last`` (exclusive), (N, H, W) or (N, C, H, W); it needs
@@ -35,7 +41,7 @@ class BlockReader(FrameReader):
         self._block: Array | None = None
 
     def frame(self, index: int) -> Array:
-        """Pixels of a frame as stored."""
+        """Pixels of a frame as stored: (H, W) or (C, H, W), in ``info.dtype``; ``FrameError`` if it is damaged."""
         if self._block is None or not self._first <= index < self._first + len(self._block):
             self._block = None  # before the next block is allocated
             self._first = index - index % self._together
@@ -48,12 +54,14 @@ class BlockReader(FrameReader):
         return frame
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file, if it is open between frames."""
         self._block = None
         self._close()
 
 
-def contiguous_reader(path: Path, info: StackInfo, offset: int, dtype: np.dtype) -> BlockReader:
+def contiguous_reader(
+    path: Path, info: StackInfo, offset: int, dtype: np.dtype, *, channels_last: bool = False
+) -> FrameReader:
     """Reader of frames of a ``dtype`` with its byte order that lie one after another in a file from an ``offset`` on.
 
     Files are read instead of mapped into memory: if a mapped file shrinks, the access ends the process. A file that
@@ -71,12 +79,14 @@ def contiguous_reader(path: Path, info: StackInfo, offset: int, dtype: np.dtype)
             pixels = np.fromfile(file, dtype, size // dtype.itemsize)
         if pixels.nbytes < size:
             raise FrameError(f"{path}: truncated: frame {first} lies beyond the end of the file")
-        return info.from_stored(pixels.reshape(info.stored_shape[1:]))[None]
+        if channels_last:
+            return np.moveaxis(pixels.reshape(1, *info.shape[2:], info.shape[1]), -1, 1)
+        return pixels.reshape(1, *info.shape[1:])
 
-    return BlockReader(path, info, read, close=file.close)
+    return FrameReader(path, info, read, close=file.close)
 
 
-def part_reader(reader: FrameReader, start: int, end: int | None) -> BlockReader:
+def part_reader(reader: FrameReader, start: int, end: int | None) -> FrameReader:
     """Reader of frames ``start`` to ``end`` (exclusive; None for the last) of an open stack."""
     info, count = reader.info, reader.info.shape[0]
     last = count if end is None else end
@@ -86,18 +96,39 @@ def part_reader(reader: FrameReader, start: int, end: int | None) -> BlockReader
             f"{info.path}: frames {start}:{'' if end is None else end} of a stack of {count} frames; expected "
             f"START:END with START < END <= {count}"
         )
-    numbers = None if info.frame_numbers is None else info.frame_numbers[start:last]
     part = replace(
         info,
         shape=(last - start, *info.shape[1:]),
         frame_times=None if info.frame_times is None else info.frame_times[start:last],
-        frame_numbers=None if numbers is None else tuple(number - numbers[0] for number in numbers),
         files=None if info.files is None else info.files[start:last],
-        path=None,  # the sound of a video, and metadata of all frames, are not those of a part
-        metadata={name: None if tag and tag.scope == "stack" else tag for name, tag in info.metadata.items()},
+        path=None,  # the sound of a video is not that of a part
     )
 
     def read(first: int, _: int) -> Array:
         return reader.frame(start + first)[None]
 
-    return BlockReader(info.path or Path(), part, read, 1, info.decoding_bytes, reader.close)
+    return FrameReader(info.path or Path(), part, read, 1, info.decoding_bytes, reader.close)
+
+
+@contextmanager
+def readable_stack(path: Path, kind: str) -> Iterator[None]:
+    """Convert any exception of a decoder of a ``kind`` of files into a ``ValueError``, except a missing permission."""
+    if not path.is_dir():
+        path.open("rb").close()
+    try:
+        yield
+    except MemoryError:
+        raise
+    except Exception as error:
+        raise ValueError(f"{path}: not a readable {kind} stack: {one_line(error)}") from error
+
+
+@contextmanager
+def readable_frame(path: Path, index: int) -> Iterator[None]:
+    """Convert any exception of a decoder into a one-line ``FrameError`` of frame ``index``."""
+    try:
+        yield
+    except (MemoryError, FrameError, FileNotFoundError):
+        raise
+    except Exception as error:
+        raise FrameError(f"{path}: frame {index} cannot be read: {one_line(error)}") from error
