@@ -49,7 +49,6 @@ COMMANDS = (  # help, lists, and what is refused before anything is computed
     "run frames.tif out --config none.toml",
     "detect frames.tif --out out --config bad.toml",
     "detect frames.tif --out out --config camera.toml --exposure 1",
-    "init --list-presets",
     "cameras iphone 12",
 )
 

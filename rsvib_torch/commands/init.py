@@ -1,6 +1,5 @@
 """Commands ``init``, a configuration file for the camera of a stack, and ``cameras``, the known camera models."""
 
-import itertools
 import math
 import sys
 import textwrap
@@ -15,10 +14,10 @@ import typer
 from rsvib_torch import gyroscope, io
 from rsvib_torch.checks.validation import MistakesError, fields_of, options
 from rsvib_torch.commands.answers import run_step
-from rsvib_torch.commands.flat_command import Given, argument, option
+from rsvib_torch.commands.flat_command import Given, argument
 from rsvib_torch.commands.shared_options import SENSOR_FORMS, check_file, rate, seconds, stated_exposure
 from rsvib_torch.commands.terminal import Answer, note, warn, working
-from rsvib_torch.config import presets, read_config
+from rsvib_torch.config import read_config
 from rsvib_torch.files.atomic import whole_file
 from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.cameras import camera_mode, find_cameras
@@ -36,7 +35,7 @@ _HINTS: dict[str, str] = {name: field.description for name, field in fields_of(S
 class InitOptions:
     """Options of ``init``."""
 
-    frames: Path | None = argument(default=None)
+    frames: Path = argument()
     """Stack of frames of the camera; its size, frame rate and times are read."""
     out: Path = Path("camera.toml")
     """Configuration file to write."""
@@ -45,9 +44,6 @@ class InitOptions:
     ]
     camera: str | None = None
     """Model of the camera, for its measured row time (rsvib cameras lists them)."""
-    preset: str | None = option(None, text=f"Copy a preset instead: {', '.join(presets())}.")
-    list_presets: bool = False
-    """List the presets and exit."""
     overwrite: bool = False
     """Replace an existing configuration file."""
 
@@ -57,26 +53,14 @@ def init(given: InitOptions) -> Answer:
 
     What the file does not state is taken from the options, or asked in a terminal with an explanation where to find it.
     """
-    frames, out, sensor, camera, preset = given.frames, given.out, given.sensor, given.camera, given.preset
-    if given.list_presets:
-        listed = {}
-        for name, text in presets().items():  # with the comment at the top in one line
-            comment = itertools.takewhile(lambda line: line.startswith("#"), text.splitlines())
-            listed[name] = " ".join(line.removeprefix("#").strip() for line in comment)
-        return Answer({"Presets": [f"{name}: {text}" for name, text in listed.items()]}, {"presets": listed})
-    if preset is not None and (frames is not None or sensor or camera is not None):
-        raise ValueError("--preset is a complete configuration: give no frames and no values of the sensor with it")
-    if camera is not None and "row_time" in sensor:
+    frames, out = given.frames, given.out
+    if given.camera is not None and "row_time" in given.sensor:
         raise ValueError("--camera and --row-time both state the row time; give one of them")
-    if preset is None and frames is None:
-        raise ValueError("give a stack of frames, or --preset NAME (--list-presets lists them)")
-    check_file(out, given.overwrite, [] if frames is None else io.stack_files(frames))
-    if preset is not None and preset not in presets():
-        raise ValueError(f"--preset must be one of {', '.join(presets())}; got {preset!r}")
-    text = presets()[preset] if preset is not None else _describe_camera(Path(frames or ""), sensor, camera)
+    check_file(out, given.overwrite, io.stack_files(frames))
+    text = _describe_camera(frames, given.sensor, given.camera)
     with whole_file(out) as file:
         file.write_text(text, encoding="utf-8")
-    return Answer({}, {}, [out], [run_step(frames or Path("FRAMES"), Path("results"), ["--config", str(out)])])
+    return Answer({}, {}, [out], [run_step(frames, Path("results"), ["--config", str(out)])])
 
 
 @options

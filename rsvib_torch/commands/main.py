@@ -32,7 +32,6 @@ _COMMANDS: dict[str, Callable[..., Answer]] = {  # in the order of the help
     "calibrate": motion_commands.calibrate,
     "live": live_session,
     "export": export,
-    "simulate": stack_commands.simulate,
 }
 _EXAMPLES = """
   rsvib init frames.tif --row-time 14.6us --exposure 1/500 --frame-rate 29.97
@@ -63,8 +62,6 @@ _EXAMPLES = """
         --steady 1
   rsvib export found/vibration.json clip.gcsv --frames clip.mp4 \\
         --focal-length 1800
-  rsvib simulate scene.png frames.tif --config camera.toml
-  rsvib simulate scene.png frames.npy --config camera.toml --seed 2
 """
 _SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 120}  # characters
 

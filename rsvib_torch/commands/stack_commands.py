@@ -1,4 +1,4 @@
-"""Commands that detect and remove vibration: ``simulate``, ``detect``, ``restore`` and ``report``."""
+"""Commands that detect and remove vibration: ``detect``, ``restore`` and ``report``."""
 
 from __future__ import annotations
 
@@ -7,10 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from pydantic import Field
-
 import rsvib_torch
-from rsvib_torch import detection, imaging, io, stacks, video
+from rsvib_torch import detection, io, stacks, video
 from rsvib_torch import frames as preparation
 from rsvib_torch import report as reports
 from rsvib_torch.checks.validation import options
@@ -28,9 +26,6 @@ if TYPE_CHECKING:
 
     from rsvib_torch.config import Config
     from rsvib_torch.motion.detected_vibration import DetectedVibration
-
-
-Seed = Annotated[int, Field(ge=0, le=2**63 - 1)]
 
 
 def load(given: shared.StackCommand, restoration: Table | None = None) -> tuple[Tensor, rsvib_torch.SensorTiming]:
@@ -61,62 +56,6 @@ def print_notes(info: io.StackInfo, config: Config) -> None:
 def _detect(frames: Tensor, timing: rsvib_torch.SensorTiming, config: Config) -> detection.DetectionResult:
     with working("detecting the vibration"):
         return detection.detect_vibration(frames, timing, **config.detection)
-
-
-@options
-class SimulateOptions(shared.CameraOptions, shared.DeviceOptions):
-    """Options of ``simulate``."""
-
-    scene: Path = argument()
-    """Image of the scene at rest, larger than the frames."""
-    frames: Path = argument()
-    """Stack to write."""
-    full_scale: float | None = None
-    """Count of the scene's file that corresponds to full scale."""
-    seed: Seed | None = option(None, show_default="from the configuration")
-    """Seed of the noise."""
-
-
-def simulate(given: SimulateOptions) -> Answer:
-    """Simulate frames of a vibrating camera.
-
-    The camera, its vibration and its noise are described in the configuration file.
-    """
-    import torch  # noqa: PLC0415
-
-    settings, frames, scene = given.settings_for(None), given.frames, given.scene
-    shared.check_new(io.stack_files(frames), given.overwrite, [*io.stack_files(scene), settings.path])
-    if settings.simulation is None:
-        raise ValueError(f"{settings.source}: simulation: missing key; expected a table with vibration, num_frames")
-    simulation, target = settings.simulation, given.torch_device
-    vibration = simulation.vibration.to_vibration()
-    image = io.read_stack(scene, full_scale=given.full_scale)
-    if len(image) != 1:
-        raise ValueError(f"{scene}: the scene must be one image, this file has {len(image)} frames")
-    scale = settings.full_scale
-    dtype = "float32" if scale is None else "uint8" if scale <= 255 else "uint16"
-    io.check_stack_target(frames, (simulation.num_frames, *image.shape[1:]), dtype=dtype, full_scale=scale)
-    with working("simulating the frames"):
-        generator = torch.Generator(target).manual_seed(simulation.seed if given.seed is None else given.seed)
-        simulated = imaging.simulate_frames(
-            image[0].to(target),
-            settings.timing,
-            vibration,
-            simulation.num_frames,
-            frame_size=simulation.frame_size,
-            noise=simulation.noise,
-            generator=generator,
-        )
-    with working(f"writing {frames}"):
-        stated = io.StackInfo(tuple(simulated.shape), dtype, scale, frame_rate=settings.timing.frame_rate)
-        io.write_stack(frames, simulated, dtype=dtype, full_scale=scale, like=stated)
-    line = f"{len(simulated)} frames of {simulated.shape[-2]} x {simulated.shape[-1]} px, {dtype}"
-    return Answer(
-        {"Simulated frames": [line, f"vibration:\n{vibration}"]},
-        {"shape": list(simulated.shape), "dtype": dtype, "vibration": vibration.to_dict()},
-        [frames],
-        [answers.run_step(frames, frames.with_name("results"), settings.arguments)],
-    )
 
 
 @options

@@ -16,15 +16,6 @@ from small_stack import CAMERA
 import rsvib_torch as rsv
 from rsvib_torch.commands.main import run_command
 
-_SIMULATION = """
-[simulation]
-num_frames = 2
-frame_size = [48, 48]
-[simulation.vibration]
-amplitude = [1.0, 1.0]
-frequency = [100.0, 120.0]
-"""
-
 
 def _write_originals(folder: Path, source: Path) -> None:
     """Inputs of all kinds."""
@@ -32,8 +23,7 @@ def _write_originals(folder: Path, source: Path) -> None:
     counts = tifffile.imread(source)[:4]
     for name in ("frames.tif", "pngs", "frames.zarr", "frames.raw", "frames.npy", "frames.h5", "frames.mkv"):
         write_stack(folder / name, counts)
-    write_stack(folder / "scene.png", counts[:1])
-    (folder / "camera.toml").write_text(CAMERA + _SIMULATION)
+    (folder / "camera.toml").write_text(CAMERA)
     times = "\n".join(f"{0.001 * index},0.1,0.2" for index in range(100))
     (folder / "motion.csv").write_text(f"time,x,y\n{times}\n")
     shutil.copy(source.with_name("vibrations.json"), folder / "vibrations.json")
@@ -96,8 +86,6 @@ def _attempts(place: Path) -> Iterator[tuple[str, Callable[..., None], tuple[obj
     for stack in ("frames.tif", "frames.npy", "frames.raw", "frames.mkv"):
         arguments = (place / stack, place, "--output", stack, *config)
         yield command(f"run {stack}: --output is the input", "run", *arguments)
-    for alias, output in _aliases(place / "scene.png").items():
-        yield command(f"simulate: {alias}", "simulate", place / "scene.png", output, *config)
     for stack in ("frames.tif", "pngs"):
         for alias, output in _aliases(place / stack, ending=".csv").items():
             yield command(f"motion: {alias}", "motion", place / stack, "--out", output, *config)

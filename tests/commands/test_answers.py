@@ -30,12 +30,8 @@ row_time = 1e-4
 exposure_rows = 6
 frame_rows = 200
 full_scale = 4095
-
-[simulation]
-frame_size = [96, 64]
-vibration = {amplitude = [1.0, 2.0], frequency = [130.0, 90.0]}
 """
-COMMANDS = ("run", "detect", "restore", "report", "motion", "known", "calibrate", "simulate")
+COMMANDS = ("run", "detect", "restore", "report", "motion", "known", "calibrate")
 
 
 @pytest.fixture(scope="module", name="place")
@@ -50,7 +46,6 @@ def make_place(tmp_path_factory):
         rsv.write_stack(folder / f"{name}.tif", frames, dtype="uint16", full_scale=4095)
     light = 0.4 + 0.2 * torch.cos(2 * torch.pi * torch.arange(512) / 64)
     rsv.write_stack(folder / "led.png", light[None, :, None].expand(1, 512, 16), dtype="uint16", full_scale=65535)
-    rsv.write_stack(folder / "scene.png", torch.rand(1, 300, 300), dtype="uint16", full_scale=65535)
     long = (folder / "long.tif", "--config", folder / "camera.toml", "--quiet")
     assert rsvib("detect", *long, "--out", folder / "found") == 0
     assert rsvib("motion", *long, "--out", folder / "m.csv") == 0
@@ -116,7 +111,6 @@ WORK = {  # arguments of a command, results that it does not replace, and keys o
     "report": ("frames.tif {}", "report.html", "detection restoration"),
     "motion": ("long.tif --out {}/m.csv", "m.csv", "motion columns"),
     "calibrate": ("led.png --frequency 1000 --out {}/c.toml", "c.toml", "calibration"),
-    "simulate": ("scene.png {}/s.tif", "s.tif", "shape dtype vibration"),
     "restore": ("long.tif {}/r.tif --vibration found/vibration.json", "r.tif", "detection restoration"),
     "known": ("long.tif {}/r.tif --motion m.csv --unit px --offset 0", "r.tif", "alignment check restoration"),
 }
@@ -152,9 +146,6 @@ def test_json_is_the_only_output(command, capsys):
         assert (answer["restoration"]["axes"], answer["restoration"]["outcome"]) == (["x", "y"], "helps")
     if "check" in keys:
         assert answer["check"]["helps"] is True
-    if "shape" in keys:
-        assert answer["vibration"]["amplitude"] == [[1.0], [2.0]]
-        assert answer["shape"] == list(rsv.read_stack(answer["files"][0]).shape)
 
 
 def test_existing_results_are_not_replaced(command, tmp_path, capsys):

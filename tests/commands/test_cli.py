@@ -10,38 +10,31 @@ import torch
 from program import refused, rsvib
 from truth import MARGIN, Curve, Motion, crop, decibel, draw_scene, take_frames
 
-from rsvib_torch import SensorTiming, __version__
+from rsvib_torch import SensorNoise, SensorTiming, StackInfo, Vibration, __version__, simulate_frames
 from rsvib_torch.io import read_stack, read_stack_info, write_stack
 
 AMPLITUDE, FREQUENCY, PHASE = (1.6, 1.1), (71.0, 113.0), (0.6, -1.2)
-CONFIG = f"""
+CONFIG = """
 [sensor]
 row_time = 4e-5
 exposure_rows = 12
 frame_rows = 512
 full_scale = 4095
-
-[simulation]
-frame_size = [304, 176]
-seed = 5
-
-[simulation.vibration]
-amplitude = {list(AMPLITUDE)}
-frequency = {list(FREQUENCY)}
-phase = {list(PHASE)}
-
-[simulation.noise]
-read_noise = 0.003
 """
 
 
 @pytest.fixture(scope="module", name="place")
 def make_place(tmp_path_factory):
-    """A folder with a config, a scene, and simulated frames."""
+    """A folder with a config, a scene, and frames of it."""
     folder = tmp_path_factory.mktemp("camera")
     (folder / "camera.toml").write_text(CONFIG)
     write_stack(folder / "scene.png", draw_scene(368, 240, 11)[None], dtype="uint16", full_scale=65535)
-    assert rsvib("simulate", folder / "scene.png", folder / "frames.tif", "--config", folder / "camera.toml") == 0
+    scene, timing = read_stack(folder / "scene.png")[0], SensorTiming.from_file(folder / "camera.toml")
+    noise, generator = SensorNoise(read_noise=0.003), torch.Generator().manual_seed(5)
+    vibration = Vibration(AMPLITUDE, FREQUENCY, PHASE)
+    frames = simulate_frames(scene, timing, vibration, 2, frame_size=(304, 176), noise=noise, generator=generator)
+    info = StackInfo(tuple(frames.shape), "uint16", 4095.0, frame_rate=timing.frame_rate)
+    write_stack(folder / "frames.tif", frames, dtype="uint16", full_scale=4095, like=info)
     return folder
 
 
@@ -209,7 +202,7 @@ def test_outputs_that_cannot_be_written(place, vibration_text, tmp_path, capsys,
         (restore_arguments(place, tmp_path, "none/r.tif"), "none does not exist"),
         (("detect", frames, *config, "--out", tmp_path / "file"), "a file of that name exists"),
         (("run", frames, tmp_path / "file" / "out", *config), "file is not writable"),
-        (("simulate", place / "scene.png", tmp_path / "f.webm", *config), "wmv files can only be read"),
+        (restore_arguments(place, tmp_path, "f.webm"), "wmv files can only be read"),
         (("run", tmp_path / "none.tif", tmp_path / "out", *config), "none.tif does not exist"),
         (("detect", frames, "--config", "none.toml", "--out", tmp_path / "out"), "none.toml: No such"),
     ]
@@ -226,15 +219,6 @@ def test_outputs_that_cannot_be_written(place, vibration_text, tmp_path, capsys,
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_simulated_noise_has_a_seed(place, tmp_path):
-    for name, seed in (("a", 5), ("b", 6)):
-        arguments = (place / "scene.png", tmp_path / f"{name}.tif", "--config", place / "camera.toml", "--seed", seed)
-        assert rsvib("simulate", *arguments) == 0
-    first, second = (tifffile.imread(tmp_path / f"{name}.tif").astype(float) for name in "ab")
-    assert (first == tifffile.imread(place / "frames.tif")).all()
-    assert np.std(first - second) == pytest.approx(0.003 * 4095 * 2**0.5, rel=0.05)
-
-
 def test_usage_errors(capsys, tmp_path):
     detect = ("detect", "f.tif", "--out", tmp_path)
     for arguments, message in (
@@ -249,7 +233,7 @@ def test_usage_errors(capsys, tmp_path):
     ):
         assert message in refused(capsys, *arguments)
     assert rsvib() == 0
-    assert "simulate" in capsys.readouterr().out
+    assert "calibrate" in capsys.readouterr().out
     assert rsvib("--version") == 0
     assert capsys.readouterr().out == f"rsvib {__version__}\n"
 

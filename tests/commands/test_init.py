@@ -1,4 +1,4 @@
-"""rsvib init: configuration files for the camera of a stack, and presets."""
+"""rsvib init: configuration files for the camera of a stack."""
 
 import tomllib
 
@@ -8,7 +8,7 @@ import torch
 from program import Terminal, refused, rsvib
 from small_video import write_video
 
-from rsvib_torch.config import presets, read_config
+from rsvib_torch.config import read_config
 from rsvib_torch.io import StackInfo, write_stack
 
 TIMES = ("--row-time", "40us", "--exposure", "1/1250")
@@ -128,7 +128,6 @@ def test_end_of_the_answers_writes_nothing(place, frames, monkeypatch, capsys):
         (("--row-time", "40"), "row_time=40 s is longer than 10 ms; row_time is in seconds (40 us is 40e-6)"),
         (("--row-time", "600us"), "with 29.97 frames/s, row_time is at most 0.000521354 s"),
         (("--frame-rate", "0.033"), "frame_rate=0.033 is less than 0.1; it is in frames per second"),
-        (("--preset", "iso12233"), "give no frames and no values of the sensor with it"),
         (("--out", "none/camera.toml"), "folder"),
     ],
 )
@@ -151,24 +150,3 @@ def test_typical_mistakes_are_warned_of(place, frames, capsys, row_time, message
     write_stack("f.npy", frames)
     assert init("f.npy", "--row-time", row_time, "--exposure", "1ms", *RATE) == 0
     assert message in capsys.readouterr().err
-
-
-def test_presets(place, frames, capsys):
-    assert init("--list-presets") == 0
-    shown = capsys.readouterr().out.splitlines()
-    assert shown[0] == "Presets"
-    assert [line.split(":")[0].strip() for line in shown[1:] if line] == list(presets())
-    assert shown[2].endswith("a rolling-shutter camera in front of an ISO 12233 chart.")
-    assert list(place.iterdir()) == []
-    assert init("--preset", "in_orbit") == 0
-    assert (place / "camera.toml").read_text() == presets()["in_orbit"]
-    for arguments, message in (
-        (("--preset", "push_scan"), "results exist already in"),
-        (("--preset", "moon", "--overwrite"), "--preset must be one of in_orbit, iso12233, push_scan; got 'moon'"),
-        ((), "give a stack of frames, or --preset NAME"),
-        (("none.mp4", *TIMES, "--out", "c.toml"), "none.mp4 does not exist"),
-    ):
-        assert message in refused(capsys, "init", *arguments)
-    assert (place / "camera.toml").read_text() == presets()["in_orbit"]
-    assert init("--preset", "push_scan", "--overwrite") == 0
-    assert (place / "camera.toml").read_text() == presets()["push_scan"]
