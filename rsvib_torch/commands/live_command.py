@@ -17,7 +17,7 @@ from rsvib_torch import io, tracking, video
 from rsvib_torch.checks.validation import Count, NotNegative, options
 from rsvib_torch.commands.answers import detection_data
 from rsvib_torch.commands.flat_command import Given, argument, option
-from rsvib_torch.commands.shared_options import CameraOptions, RangeOptions, check_file, size_of
+from rsvib_torch.commands.shared_options import CameraOptions, check_file, size_of
 from rsvib_torch.commands.terminal import Answer, error_line, warn
 from rsvib_torch.files.reading import Table
 from rsvib_torch.options import BorderName, PixelFormat, TrackerOptions, method_options
@@ -30,7 +30,7 @@ _AT_LEAST_2 = Annotated[int, Field(ge=2)]
 
 
 @options
-class LiveOptions(CameraOptions, RangeOptions):
+class LiveOptions(CameraOptions):
     """Options of ``live``."""
 
     source: str = argument()
@@ -67,12 +67,10 @@ class LiveOptions(CameraOptions, RangeOptions):
     def file(self) -> Path | None:
         """The frames of a file that are used; None for the number or URL of a camera, and for standard input."""
         if self.source == "-" or self.is_camera:
-            if self.frame_range is not None:
-                raise ValueError(f"--frames goes with a file, not with {self.source}; --num-frames ends a session")
             return None
         if not io.stack_files(self.source)[0].exists():
             raise FileNotFoundError(f"{self.source}: no such file; a camera is a number or a URL")
-        return self.part_of(Path(self.source))
+        return Path(self.source)
 
     @property
     def is_camera(self) -> bool:
@@ -91,7 +89,7 @@ def live_session(given: LiveOptions) -> Answer:
     The source is never blocked: if frames come faster than they are processed, the oldest waiting ones are dropped and
     counted. Ctrl-C ends the session. The video can be played at any moment, also after a crash or on a full disk.
     """
-    settings = given.settings_for(None if given.file is None else Path(given.source), given.frame_range)
+    settings = given.settings_for(given.file)
     _check_options(given)
     files = [] if given.written is None else [given.written]
     inputs = [*([] if given.file is None else io.stack_files(given.file)), settings.path]

@@ -45,7 +45,7 @@ def motion(given: MotionOptions) -> Answer:
 
     To restore frames with the CSV file: rsvib known --motion FILE --unit px --offset 0.
     """
-    out, frames = given.out, given.stack
+    out, frames = given.out, given.frames
     shared.check_file(out, given.overwrite, given.inputs)
     chosen = {name: value for name, value in given.detection.items() if given.model == "free" or name == "search"}
     pixels, timing = load(given)
@@ -160,7 +160,7 @@ def known(given: KnownOptions) -> Answer:
                 fit_gain=given.fit_gain,
                 fit_row_time=given.fit_row_time,
             )
-            found = stacks.align_stack(given.stack, info, timing, recorded, chosen)
+            found = stacks.align_stack(given.frames, info, timing, recorded, chosen)
         results["Recording on the clock of the frames"] = [found.summary()]
         data["alignment"] = _without_curves(found)
         _refuse(given, found.reasons)
@@ -191,8 +191,10 @@ def known(given: KnownOptions) -> Answer:
     counts = info.shape[0] > 8
     of_run = given.of_stack(scale, options) | {"force": given.force, "motion": placed}
     of_run |= {name: value for name, value in given.settings.stack.items() if name == "window"} | given.processing
-    with working(f"restoring {given.stack.name}", counts=counts) as progress:
-        run = stacks.process_stack(given.stack, given.restored, timing, **of_run, progress=progress if counts else None)
+    with working(f"restoring {given.frames.name}", counts=counts) as progress:
+        run = stacks.process_stack(
+            given.frames, given.restored, timing, **of_run, progress=progress if counts else None
+        )
     results["Restoration"], data["restoration"] = answers.restoration_of(run, given.restored)
     return Answer(results, data, [given.restored, given.manifest])
 
@@ -238,7 +240,7 @@ def _check_motion(
     """
     try:
         with working("comparing the motion"):
-            check = stacks.check_stack_motion(given.stack, info, timing, motion, ignore)
+            check = stacks.check_stack_motion(given.frames, info, timing, motion, ignore)
     except ValueError as error:
         if given.offset is None:
             raise
@@ -259,11 +261,11 @@ _CALIBRATED_FRAMES = 32
 
 
 @options
-class CalibrateOptions(shared.RangeOptions):
+class CalibrateOptions:
     """Options of ``calibrate``."""
 
     frames: list[Path] = argument()
-    """One or more stacks of frames: TIFF, PNG, video ..."""
+    """One or more stacks of frames: TIFF, PNG, video ...; of NAME[100:200] frames 100 to 199."""
     flicker_frequency: float | None = option(None, "--frequency")
     """Flicker frequency in Hz; a mains-powered light flickers at twice the mains frequency."""
     exposure: float | None = option(None, **shared.TIME)
@@ -300,12 +302,12 @@ def calibrate(given: CalibrateOptions) -> Answer:
     reason.
     """
     _check_given(given)
-    paths = [given.part_of(path) for path in given.frames]
+    paths = given.frames
     if given.out is not None:
         shared.check_file(given.out, given.overwrite, [file for path in paths for file in io.stack_files(path)])
     infos = [io.read_stack_info(path) for path in paths]
-    if given.frame_range is None and infos[0].shape[0] > _CALIBRATED_FRAMES:
-        note(f"the first {_CALIBRATED_FRAMES} of {infos[0].shape[0]} frames are used; --frames selects others")
+    if io.split_range(paths[0])[1] is None and infos[0].shape[0] > _CALIBRATED_FRAMES:
+        note(f"the first {_CALIBRATED_FRAMES} of {infos[0].shape[0]} frames are used; NAME[START:END] are others")
         paths = [path.with_name(f"{path.name}[0:{_CALIBRATED_FRAMES}]") for path in paths[:1]]
         infos = [io.read_stack_info(path) for path in paths]
     for sentence in (sentence for info in infos for sentence in io.describe_stack(info, None)):

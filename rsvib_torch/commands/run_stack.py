@@ -65,7 +65,7 @@ def run(given: RunOptions) -> Answer:
     --resume continues. With --video, the vibration of a video is followed frame by frame: --steady 1 --border crop
     makes a shaky video steady.
     """
-    settings, frames, out, output = given.settings, given.stack, given.out, given.output.removesuffix("/")
+    settings, frames, out, output = given.settings, given.frames, given.out, given.output.removesuffix("/")
     if given.moved and not given.video:
         raise ValueError(f"--{next(iter(given.moved)).replace('_', '-')} goes with --video")
     if "lens_profile" in given.moved and "gyroscope" not in given.moved:
@@ -96,7 +96,7 @@ def run(given: RunOptions) -> Answer:
 
 
 def _run_windows(given: RunOptions, restored: Path, info: io.StackInfo, common: Table, chosen: WindowOptions) -> Answer:
-    settings, frames, out = given.settings, given.stack, given.out
+    settings, frames, out = given.settings, given.frames, given.out
     common |= {"window": chosen.window, "follow": chosen.follow, "force": given.force}
     common["detection"] = None if chosen.follow is True else settings.detection  # a tracker has none
     resources = {name: value for name, value in given.processing.items() if name in ("memory", "workers")}
@@ -143,7 +143,7 @@ def _run_windows(given: RunOptions, restored: Path, info: io.StackInfo, common: 
 def _comparison(given: RunOptions, common: Table, first: stacks.WindowResult) -> Figure:
     """Draw the first restored frame of a stack beside the frame of the input."""
     index = first.indices[0] if first.indices else (first.window.first + first.window.last + 1) // 2
-    raw = read_frame(given.stack, index, common["full_scale"])
+    raw = read_frame(given.frames, index, common["full_scale"])
     pattern = common["restoration"].get("mosaic")
     if pattern is not None:
         raw = preparation.colour_frames(raw[None], pattern)[0]
@@ -154,7 +154,7 @@ def _comparison(given: RunOptions, common: Table, first: stacks.WindowResult) ->
 
 def _run_followed(given: RunOptions, restored: Path, common: Table) -> Answer:
     """Process a video from frame to frame."""
-    settings, frames, out, restoration = given.settings, given.stack, given.out, common["restoration"]
+    settings, frames, out, restoration = given.settings, given.frames, given.out, common["restoration"]
     changed = [name for name, value in given.windows.items() if value not in (False, "pass")]
     changed += [name for name in ("scheduler", "compression") if name in given.processing]
     changed += ["optics_sigma" if name == "optics" else name for name in stacks.options_of_windows(restoration)]

@@ -3,7 +3,7 @@
 import os
 import re
 import statistics
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from fractions import Fraction
 from functools import cached_property
@@ -61,19 +61,11 @@ def rate(text: str) -> float:
     return _with_unit(text, {"": 1}, "a number such as 29.97 or 30000/1001")
 
 
-def _of_form(pattern: str, expected: str) -> Callable[[str], str]:
-    """Parser of a text of a form, which returns it as it was given."""
-
-    def parse(text: str) -> str:
-        if re.fullmatch(pattern, text) is None:
-            raise typer.BadParameter(f"expected {expected}, got {text!r}")
-        return text
-
-    return parse
-
-
-_range_of_frames = _of_form(r"\d*:\d*", "START:END such as 100:200, 100: or :200")
-_axes = _of_form(rf"({'|'.join(AXES)})(,({'|'.join(AXES)}))*", "axes such as x,y or x,y,roll,zoom")
+def _axes(text: str) -> str:
+    """Names of axes with commas between them."""
+    if not set(text.split(",")) <= set(AXES):
+        raise typer.BadParameter(f"expected axes such as x,y or x,y,roll,zoom, got {text!r}")
+    return text
 
 
 def size_of(text: str, expected: str) -> tuple[int, int]:
@@ -98,20 +90,6 @@ SENSOR_FORMS: dict[str, Table] = {
     "scan_axis": {},
     "readout_direction": {},
 }
-
-
-@options
-class RangeOptions:
-    """A part of the frames of a stack."""
-
-    frame_range: str | None = option(
-        None, "--frames", parser=_range_of_frames, metavar="START:END", show_default="all frames"
-    )
-    """Use only the frames START to END - 1, counted from 0; times count from the first of them."""
-
-    def part_of(self, path: Path) -> Path:
-        """The path of a stack, or of the frames that are used of it, ``NAME[START:END]``."""
-        return path if self.frame_range is None else path.with_name(f"{path.name}[{self.frame_range}]")
 
 
 @options
@@ -145,7 +123,7 @@ class CameraOptions:
     overwrite: bool = False
     """Replace results that exist already."""
 
-    def settings_for(self, frames: Path | None, frame_range: str | None = None) -> Config:
+    def settings_for(self, frames: Path | None) -> Config:
         """Configuration file and the options that replace its keys, or these alone and what the frames state."""
         sensor = self.sensor
         if self.readout_time is not None:
@@ -166,14 +144,13 @@ class CameraOptions:
                 "such a file and explains its values)"
             )
         settings = read_config(self.config, sensor=sensor)
-        if frames is not None and "frame_rate" in self.sensor and settings.timing.frame_start_times is None:
+        starts, used = settings.timing.frame_start_times, None if frames is None else io.split_range(frames)[1]
+        if starts is not None and used is not None:  # those of the configuration count from frame 0 of the file
+            part = starts[slice(*used)] or starts
+            relative = tuple(float(start - part[0]) for start in part)
+            settings = replace(settings, timing=replace(settings.timing, frame_start_times=relative))
+        elif starts is None and frames is not None and "frame_rate" in self.sensor:
             settings = replace(settings, timing=_evenly_timed(settings.timing, io.read_stack_info(frames)))
-        starts = settings.timing.frame_start_times
-        if frame_range is not None and starts is not None:  # those of the file are read with its frames
-            first, _, end = frame_range.partition(":")
-            used = list(starts)[int(first or 0) : int(end) if end else None]
-            relative = tuple(float(start - used[0]) for start in used)
-            settings = replace(settings, timing=replace(settings.timing, frame_start_times=relative or starts))
         arguments = [] if self.config is None else ["--config", str(self.config)]
         for name, value in sensor.items():
             arguments += [_TIMES.get(name, f"--{name.replace('_', '-')}")]
@@ -184,26 +161,22 @@ class CameraOptions:
 
 
 @options
-class StackCommand(RangeOptions, CameraOptions, DeviceOptions):
+class StackCommand(CameraOptions, DeviceOptions):
     """A command that reads a stack of frames."""
 
     frames: Path = argument()
-    """Stack of frames: TIFF, .npy, HDF5, Zarr, raw, video, or a folder of PNG, TIFF or JPEG files."""
-
-    @cached_property
-    def stack(self) -> Path:
-        """The path of the frames that are used."""
-        return self.part_of(self.frames)
+    """Stack of frames: TIFF, .npy, HDF5, Zarr, raw, video, or a folder of PNG, TIFF or JPEG files. NAME[100:200] are
+    its frames 100 to 199, from the first of which times count."""
 
     @cached_property
     def settings(self) -> Config:
         """The camera and the options of the configuration."""
-        return self.settings_for(self.frames, self.frame_range)
+        return self.settings_for(self.frames)
 
     @cached_property
     def info(self) -> "StackInfo":
         """What the file of the frames states."""
-        return io.read_stack_info(self.stack)
+        return io.read_stack_info(self.frames)
 
     @cached_property
     def scale(self) -> float | None:
@@ -212,17 +185,17 @@ class StackCommand(RangeOptions, CameraOptions, DeviceOptions):
         if self.full_scale is not None or not self.info.is_integer:
             return self.full_scale
         if stated is None and configured is None:
-            unknown = f"{self.stack}: the full scale of its {self.info.dtype} counts is not known"
+            unknown = f"{self.frames}: the full scale of its {self.info.dtype} counts is not known"
             raise ValueError(f"{unknown}: give --full-scale, e.g. 4095 for 12 bits, or full_scale in [sensor]")
         if stated is not None and self.info.dtype != "uint8" and configured not in (None, stated):
             both = f"{stated:g} in the file and {configured:g} in the configuration"
-            raise ValueError(f"{self.stack}: the full scale is {both}; choose one with --full-scale")
+            raise ValueError(f"{self.frames}: the full scale is {both}; choose one with --full-scale")
         return configured if stated is None else stated
 
     @property
     def inputs(self) -> list[Path]:
         """Files that are read."""
-        return [*io.stack_files(self.stack), *([] if self.config is None else [self.config])]
+        return [*io.stack_files(self.frames), *([] if self.config is None else [self.config])]
 
     def of_stack(self, scale: float | None, restoration: Table) -> Table:
         """Options that the functions for stacks have in common."""
@@ -317,12 +290,12 @@ def _evenly_timed(timing: SensorTiming, info: "StackInfo") -> SensorTiming:
     if stated is None or even is None or even == stated:
         return timing
     note(f"equal intervals by --frame-rate replace the {info.time_source} of {info.path}, which are irregular")
-    return replace(timing, frame_start_times=even)
+    return replace(timing, frame_start_times=tuple(time - even[0] for time in even))
 
 
 def stated_exposure(path: Path) -> float | None:
     """Exposure in s that the track of a GoPro video states, the median over its frames."""
-    track = gyroscope.read_camera_track(path)
+    track = gyroscope.read_camera_track(io.split_range(path)[0])
     if track is None or not len(track.exposures):
         return None
     exposures: list[float] = track.exposures.tolist()

@@ -34,8 +34,8 @@ def load(given: shared.StackCommand, restoration: Table | None = None) -> tuple[
     The frames are (T, H, W) or (T, C, H, W), full scale 1; the timing has the frame times of the file.
     """
     stacks.check_stack_fits(given.info, restoration, on_gpu=given.torch_device.type != "cpu")
-    with working(f"reading {given.stack}"):
-        frames = io.read_stack(given.stack, full_scale=given.scale)
+    with working(f"reading {given.frames}"):
+        frames = io.read_stack(given.frames, full_scale=given.scale)
     print_notes(given.info, given.settings)
     return frames.to(given.torch_device), io.timing_from_first_frame(given.settings.timing, given.info)
 
@@ -87,7 +87,7 @@ def detect(given: DetectOptions) -> Answer:
     The vibration is modelled as sinusoids of constant amplitude and frequency; if they change within the frames, they
     are followed from frame to frame. For other motion see rsvib motion.
     """
-    settings, frames, out = given.settings, given.stack, given.out
+    settings, frames, out = given.settings, given.frames, given.out
     answers.check_folder(out, (*answers.OF_DETECTION, *answers.OF_WINDOWS), given.overwrite, given.inputs)
     windows = {name: value for name, value in settings.stack.items() if name in ("window", "follow")} | given.windows
     count = given.info.shape[0]
@@ -132,9 +132,9 @@ _LONG = 256
 
 def _detect_windows(given: DetectOptions, manifest: Path, windows: Table) -> stacks.StackManifest:
     """Detect the vibration in the windows of a stack, and write the manifest."""
-    with working(f"detecting in {given.stack.name}", counts=True) as progress:
+    with working(f"detecting in {given.frames.name}", counts=True) as progress:
         stacks.detect_stack(
-            given.stack,
+            given.frames,
             manifest,
             given.settings.timing,
             **windows,
@@ -162,7 +162,7 @@ def restore_frames(given: RestoreOptions) -> Answer:
     The result is judged. If the restored frames are judged no better than the input, the input is written
     unchanged, unless --force is given.
     """
-    settings, frames, restored, report = given.settings, given.stack, given.restored, given.report
+    settings, frames, restored, report = given.settings, given.frames, given.restored, given.report
     outputs = [*io.stack_files(restored), given.manifest, *([] if report is None else [report])]
     shared.check_new(outputs, given.overwrite, [*given.inputs, given.vibration])
     check_regular(given.vibration)
@@ -236,7 +236,7 @@ def report(given: ReportOptions) -> Answer:
 
     Detection, restoration and verdict are those of rsvib run. The page needs no network; figures are also PNG files.
     """
-    settings, frames, out = given.settings, given.stack, given.out
+    settings, frames, out = given.settings, given.frames, given.out
     list(map(_edge_box, given.edge or ()))  # errors before anything is computed
     windows = None if given.manifest is None else stacks.read_manifest(given.manifest)
     inputs = [*given.inputs, *([] if given.manifest is None else [given.manifest])]
@@ -286,9 +286,9 @@ def _report_of_run(given: ReportOptions, windows: stacks.StackManifest, made: Pa
     import torch  # noqa: PLC0415
 
     first, scale = max(windows.input["shape"][0] // 2 - 1, 0), windows.settings["full_scale"]
-    of_both = ((given.stack, scale), (made, None if io.is_video(made) else scale))
+    of_both = ((given.frames, scale), (made, None if io.is_video(made) else scale))
     before, after = (torch.stack([read_frame(path, first + n, full) for n in (0, 1)]) for path, full in of_both)
-    answer = answers.windows_answer(f"Vibration in {given.stack.name}", windows)
+    answer = answers.windows_answer(f"Vibration in {given.frames.name}", windows)
     answer.results[f"Restoration according to {given.manifest}"] = windows.lines()[1]
     page = reports.Report(
         **_page_head(given, windows),
@@ -304,8 +304,8 @@ def _report_of_run(given: ReportOptions, windows: stacks.StackManifest, made: Pa
 def _page_head(given: ReportOptions, windows: stacks.StackManifest | None) -> Table:
     """Content of a page apart from the frames."""
     return {
-        "title": printable(f"Vibration in {given.stack.name}"),
-        "subtitle": printable(f"{given.stack}, camera of {given.settings.source}"),
+        "title": printable(f"Vibration in {given.frames.name}"),
+        "subtitle": printable(f"{given.frames}, camera of {given.settings.source}"),
         "version": rsvib_torch.__version__,
         "command": current_output().command,
         "windows": windows,

@@ -69,7 +69,6 @@ def test_a_file_at_its_own_rate(clip, capsys):
     [
         (("-",), "--size WIDTHxHEIGHT is required for raw frames on standard input"),
         (("0", "--realtime"), "--realtime goes with a file, not with 0"),
-        (("0", "--frames", "5:9"), "--frames goes with a file, not with 0; --num-frames ends a session"),
         (("none.mp4",), "none.mp4: no such file; a camera is a number or a URL"),
         (("CLIP", "--out", "still.gif"), "a live video is written to .mp4, .mov, .m4v or .mkv"),
         (("CLIP", "--out", "CLIP", "--overwrite"), "it is the input"),

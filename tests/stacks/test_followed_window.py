@@ -181,8 +181,8 @@ def test_two_steady_tones_near_the_frame_rate_are_not_reliable_and_wrong():
 
 
 def test_windows_state_the_vibration_of_their_frames(place, tmp_path):
-    options = ("--window", 14, "--follow", "--frames", "0:20", "--out", tmp_path / "found")
-    assert rsvib("detect", place / "frames.npy", *CAMERA, *options) == 0
+    options = ("--window", 14, "--follow", "--out", tmp_path / "found")
+    assert rsvib("detect", place / "frames.npy[0:20]", *CAMERA, *options) == 0
     manifest = read_manifest(tmp_path / "found" / "manifest.json")
     assert len(manifest.detections()) == 20
     assert [frame for record in manifest.windows for frame in record.followed] == list(range(20))
@@ -255,8 +255,8 @@ def test_run_follows_a_vibration_that_changes_without_an_option(place, tmp_path,
 
 
 def test_following_is_refused_where_it_is_switched_off(place, tmp_path, capsys):
-    part = place / "frames.npy"
-    assert rsvib("run", part, tmp_path / "steady", *CAMERA, "--frames", "0:12", "--no-follow") == 0
+    part = place / "frames.npy[0:12]"
+    assert rsvib("run", part, tmp_path / "steady", *CAMERA, "--no-follow") == 0
     shown = " ".join(capsys.readouterr().out.split())
     assert "0 restored" in shown
     assert "--follow" in shown

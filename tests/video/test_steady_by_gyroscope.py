@@ -101,7 +101,7 @@ def test_the_track_of_the_clip_itself(place, tmp_path, capsys):
 
 def test_rates_of_another_camera_are_refused(place, tmp_path, capsys):
     write_rates(tmp_path / "other.csv", unrelated_rates(rates_of_clip().times))
-    arguments = (*steady_command(place / "clip.mp4", tmp_path), "--frames", "0:10")
+    arguments = steady_command(place / "clip.mp4[0:10]", tmp_path)
     assert "does not fit the video" in refused(capsys, *arguments, "--gyroscope", tmp_path / "other.csv")
     assert [path.name for path in tmp_path.iterdir()] == ["other.csv"]
 
