@@ -79,7 +79,10 @@ def size_of(text: str, expected: str) -> tuple[int, int]:
 TIME: Table = {"parser": seconds, "metavar": "TIME"}  # form of an option
 # Forms of the keys of [sensor] that are options.
 SENSOR_FORMS: dict[str, Table] = {
-    "row_time": {"text": "Time between the exposure starts of adjacent rows, e.g. 14.6us or 1.46e-5.", **TIME},
+    "row_time": {
+        "text": "Time between the exposure starts of adjacent rows, e.g. 14.6us, or 15/1080ms of a readout.",
+        **TIME,
+    },
     "exposure_time": {"names": ["--exposure"], "text": "Exposure time, e.g. 1/500 or 2ms.", **TIME},
     "frame_rate": {
         "text": "Frames per second of the sensor, e.g. 29.97 or 30000/1001.",
@@ -116,8 +119,6 @@ class CameraOptions:
     config: Path | None = None
     """TOML file that describes the camera; rsvib init writes one. Or give --row-time, --exposure and --frame-rate."""
     sensor: Annotated[Table, Given(SensorSection, default="from the configuration", forms=SENSOR_FORMS)]
-    readout_time: float | None = option(None, **TIME)
-    """Time in which all rows of a frame are read, e.g. 15ms, in place of --row-time."""
     full_scale: float | None = option(None, show_default="from the file, or the configuration")
     """Count of an integer format that corresponds to full scale, e.g. 4095 for 12 bits."""
     overwrite: bool = False
@@ -126,11 +127,6 @@ class CameraOptions:
     def settings_for(self, frames: Path | None) -> Config:
         """Configuration file and the options that replace its keys, or these alone and what the frames state."""
         sensor = self.sensor
-        if self.readout_time is not None:
-            if self.config is not None or "row_time" in sensor or frames is None:
-                raise ValueError("--readout-time replaces --row-time of frames in a file, and goes without --config")
-            shape = io.read_stack_info(frames).shape
-            sensor = sensor | {"row_time": self.readout_time / shape[-1 if sensor.get("scan_axis") == "x" else -2]}
         if self.config is None and frames is not None and "row_time" in sensor:
             exposure = None if "exposure_time" in sensor else stated_exposure(frames)
             sensor = sensor | ({} if exposure is None else {"exposure_time": exposure})

@@ -86,7 +86,7 @@ def test_table_has_no_row_that_contradicts_itself():
             "iPhone 12",
             (1920, 1080, 60),
             "no mode .* at 60/s: 1920 x 1080 px at 24/s Ultra Wide .readout 15.7 ms., 1920 x 1080 px at 24/s Wide "
-            ".readout 6.6 ms., 3840 x 2160 px .*; try --readout-time of a known rate",
+            ".readout 6.6 ms., 3840 x 2160 px .*; try the readout time of a known rate",
         ),
         ("iPhone 12", (640, 360, 60), ": 3840 x 2160 px at 60/s .readout 4.98 ms., .*; measure the row time"),
         ("iPhone 12", (3840, 2160, 30), "no mode of Apple iPhone 12"),  # another rate

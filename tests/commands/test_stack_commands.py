@@ -9,8 +9,7 @@ import tifffile
 from program import refused, rsvib
 from small_stack import CAMERA, HEIGHT, STILL, WIDTH, write_small
 
-from rsvib_torch import read_stack, read_stack_info, write_stack
-from rsvib_torch.datasets import example_frames
+from rsvib_torch import read_stack, read_stack_info
 
 FRAMES = 13
 CONFIG = CAMERA + "[stack]\nwindow = 4\n"
@@ -153,19 +152,6 @@ def test_bad_frames_are_reported(place, tmp_path, capsys):
 def test_errors_are_one_line_and_leave_no_files(place, tmp_path, capsys, options, message):
     assert message in refused(capsys, *command(place, tmp_path / "out", *options))
     assert list(tmp_path.iterdir()) == []
-
-
-def test_readout_time_replaces_the_row_time(tmp_path, capsys):
-    frames, timing, _ = example_frames()
-    write_stack(tmp_path / "frames.npy", frames)
-    readout = f"{1e3 * timing.row_time * frames.shape[-2]}ms"
-    camera = ("--exposure", timing.exposure_time, "--frame-rate", timing.frame_rate, "--readout-time", readout)
-    detect = ("detect", tmp_path / "frames.npy", *camera, "--out", tmp_path / "found")
-    assert rsvib(*detect) == 0
-    stored = json.loads((tmp_path / "found" / "vibration.json").read_text())["timing"]
-    assert stored["row_time"] == pytest.approx(timing.row_time)
-    message = "--readout-time replaces --row-time of frames in a file, and goes without --config"
-    assert message in refused(capsys, *detect, "--row-time", "100us", "--overwrite")
 
 
 def test_raw_frames_behind_colour_filters_on_a_finer_grid(tmp_path):
