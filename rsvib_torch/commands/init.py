@@ -1,7 +1,6 @@
 """Commands ``init``, a configuration file for the camera of a stack, and ``cameras``, the known camera models."""
 
 import math
-import sys
 import textwrap
 from collections.abc import Mapping
 from contextlib import closing
@@ -9,13 +8,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from rsvib_torch import gyroscope, io
 from rsvib_torch.checks.validation import MistakesError, fields_of, options
 from rsvib_torch.commands.answers import run_step
 from rsvib_torch.commands.flat_command import Given, argument
-from rsvib_torch.commands.shared_options import SENSOR_FORMS, check_file, rate, seconds, stated_exposure
+from rsvib_torch.commands.shared_options import SENSOR_FORMS, check_file, stated_exposure
 from rsvib_torch.commands.terminal import Answer, note, warn, working
 from rsvib_torch.config import read_config
 from rsvib_torch.files.atomic import whole_file
@@ -27,7 +24,7 @@ from rsvib_torch.text import measured_text, printable, text_table
 if TYPE_CHECKING:
     from rsvib_torch.io.stack_info import StackInfo
 
-# How to find each value of [sensor]: comments of the file, and the text of questions and errors.
+# How to find each value of [sensor]: comments of the file, and the text of errors.
 _HINTS: dict[str, str] = {name: field.description for name, field in fields_of(SensorSection).items()}
 
 
@@ -51,7 +48,7 @@ class InitOptions:
 def init(given: InitOptions) -> Answer:
     """Write a configuration file for the camera of a stack of frames.
 
-    What the file does not state is taken from the options, or asked in a terminal with an explanation where to find it.
+    What the file does not state is taken from the options; an error explains where to find what is missing.
     """
     frames, out = given.frames, given.out
     if given.camera is not None and "row_time" in given.sensor:
@@ -101,7 +98,7 @@ def _row_time_of(camera: str, info: "StackInfo", values: Table) -> tuple[dict[st
 
 
 def _describe_camera(path: Path, given: Table, camera: str | None) -> str:
-    """Text of the configuration file: values of the command line, of the file, and of the answers to questions."""
+    """Text of the configuration file: values of the command line and of the file of the frames."""
     with working(f"reading {path}"), closing(io.open_stack(path)) as reader:
         info, first = reader.info, reader.frame(0)
     size = f"{info.shape[0]} frames of {info.shape[-2]} x {info.shape[-1]} px (height x width), {info.dtype}"
@@ -121,7 +118,7 @@ def _describe_camera(path: Path, given: Table, camera: str | None) -> str:
         note(source)
     elif info.camera is not None and "row_time" not in given:
         try:
-            likely, proposed = _row_time_of(info.camera, info, values)
+            _, proposed = _row_time_of(info.camera, info, values)
             proposal = f' The file names its camera: --camera "{info.camera}" takes {proposed}.'
         except ValueError as error:
             proposal = f" The file names its camera, {info.camera}: {error}."
@@ -141,9 +138,7 @@ def _describe_camera(path: Path, given: Table, camera: str | None) -> str:
             f"the camera has stabilised the frames (IORI in the track of the video): it turned them by up to "
             f"{math.degrees(track.turned):.2g} degrees, and their rows no longer show its motion"
         )
-    _complete(values, rows, likely, proposal)
-    if "row_time" in likely and math.isclose(values["row_time"], likely["row_time"], rel_tol=1e-5):  # it was accepted
-        values["row_time_std"] = likely["row_time_std"]
+    _check_complete(values, rows, likely, proposal)
     _check_timing(read_config(None, sensor=values).timing, rows)
     head = [
         f"Camera of {printable(path.name)}: {size}. Written by rsvib init.",
@@ -158,34 +153,18 @@ def _describe_camera(path: Path, given: Table, camera: str | None) -> str:
     return sensor_toml({name: values[name] for name in order if name in values}, head)
 
 
-def _complete(values: Table, rows: int, likely: Mapping[str, float], proposal: str) -> None:
-    """Ask for the values that are missing in a terminal, otherwise name all of them in an error."""
-    known = {"frame_rate": "--frame-rate", "row_time": "--row-time", "exposure_time": "--exposure"}
-    known |= {"full_scale": "--full-scale"} if "full_scale" in likely else {}
-    missing = {name: stated for name, stated in known.items() if name not in values}
-
-    def hint(name: str) -> str:  # how to find a value, with the limits that follow from the frames
+def _check_complete(values: Table, rows: int, likely: Mapping[str, float], proposal: str) -> None:
+    """Raise an error that names the values that are missing, with what states each of them."""
+    needed = {"frame_rate": "--frame-rate", "row_time": "--row-time", "exposure_time": "--exposure"}
+    needed |= dict.fromkeys(likely, "--full-scale")
+    mistakes = []
+    for name in (name for name in needed if name not in values):
+        hint = f"{needed[name]} is missing. {_HINTS[name]}"
         if name == "row_time" and values.get("frame_rate"):
-            longest = 1e6 / (values["frame_rate"] * rows)
-            return f"{_HINTS[name]} Here it is less than {longest:.4g} us.{proposal}"
-        return f"{_HINTS[name]} Frame 0 indicates {likely[name]:g}." if name in likely else _HINTS[name]
-
-    if missing and not (sys.stdin.isatty() and sys.stderr.isatty()):
-        raise MistakesError(f"{stated} is missing. {hint(name)}" for name, stated in missing.items())
-    for name, stated in missing.items():
-        typer.echo(f"\n{hint(name)}", err=True)
-        limits = {"row_time": 1.0 / rows, "exposure_time": 1.0}  # frame periods
-        longest = limits[name] / values["frame_rate"] if name in limits else math.inf
-
-        def checked_answer(text: str, is_time: bool = name in limits, longest: float = longest) -> float:
-            value = seconds(text) if is_time else rate(text)
-            if not 0 < value <= longest:
-                limit = "" if math.isinf(longest) else f" and at most {longest:.4g} s; units such as us can be added"
-                raise typer.BadParameter(f"expected a number above 0{limit}; got {text!r}")
-            return value
-
-        question, default = stated.strip("-").replace("-", " "), f"{likely[name]:.6g}" if name in likely else None
-        values[name] = typer.prompt(question, default=default, value_proc=checked_answer, err=True)
+            hint += f" Here it is less than {1e6 / (values['frame_rate'] * rows):.4g} us.{proposal}"
+        mistakes.append(hint + (f" Frame 0 indicates {likely[name]:g}." if name in likely else ""))
+    if mistakes:
+        raise MistakesError(mistakes)
 
 
 def _check_timing(timing: SensorTiming, rows: int) -> None:

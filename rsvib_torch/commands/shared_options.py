@@ -80,7 +80,7 @@ TIME: Table = {"parser": seconds, "metavar": "TIME"}  # form of an option
 # Forms of the keys of [sensor] that are options.
 SENSOR_FORMS: dict[str, Table] = {
     "row_time": {
-        "text": "Time between the exposure starts of adjacent rows, e.g. 14.6us, or 15/1080ms of a readout.",
+        "text": "Time from one row to the next, e.g. 14.6us, or 15/1080ms of a readout of 1080 rows.",
         **TIME,
     },
     "exposure_time": {"names": ["--exposure"], "text": "Exposure time, e.g. 1/500 or 2ms.", **TIME},

@@ -10,7 +10,7 @@ import av
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
-from program import Terminal, refused, rsvib
+from program import refused, rsvib
 
 import rsvib_torch as rsv
 from rsvib_torch.config import read_config
@@ -149,15 +149,6 @@ def test_camera_that_a_video_names(capsys, tags, camera):
     assert rsvib("init", "clip.mp4", "--exposure", "1ms", "--camera", camera) == 0
     readout = {"Apple iPhone 7 Plus": 15.52e-3, "GoPro HERO6 Black": 8.34e-3}[camera]
     assert sensor()["row_time"] == pytest.approx(readout / 2160, rel=0.01)
-
-
-def test_row_time_of_the_named_camera_is_proposed_in_a_terminal(monkeypatch):
-    write_clip(size=(2160, 3840), tags={"firmware": "HD6.01.02.01.00"})
-    monkeypatch.setattr("sys.stdin", Terminal("\n1ms\n"))  # the proposal is accepted
-    monkeypatch.setattr("sys.stderr", Terminal())
-    assert rsvib("init", "clip.mp4") == 0
-    assert sensor()["row_time"] == pytest.approx(8.34167e-3 / 2160, rel=1e-5)
-    assert sensor()["row_time_std"] == pytest.approx(0.03 * sensor()["row_time"], rel=0.01)
 
 
 @pytest.mark.parametrize("kind", ["jpg", "png"])

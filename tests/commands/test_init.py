@@ -5,7 +5,7 @@ import tomllib
 import numpy as np
 import pytest
 import torch
-from program import Terminal, refused, rsvib
+from program import refused, rsvib
 from small_video import write_video
 
 from rsvib_torch.config import read_config
@@ -92,33 +92,6 @@ def test_missing_values_are_explained_in_one_line_each(place, frames, capsys):
     assert "rsvib calibrate" in error
     limit = "It is not 1 / (frame rate x rows), because sensors have blanking rows. Here it is less than 521.4 us."
     assert limit in error
-    assert not (place / "camera.toml").exists()
-
-
-def test_questions_in_a_terminal(place, frames, monkeypatch):
-    np.save("f.npy", (frames * 1000).numpy().astype(np.uint16))
-    answers = ["soon", "25", "40", "40us", "2", "1/1250", ""]
-    monkeypatch.setattr("sys.stdin", Terminal("\n".join(answers) + "\n"))
-    shown = Terminal()
-    monkeypatch.setattr("sys.stderr", shown)
-    assert init("f.npy") == 0
-    config = read_config(place / "camera.toml")
-    assert (config.timing.frame_rate, config.timing.row_time, config.timing.exposure_time) == pytest.approx(
-        (25, 4e-5, 8e-4)
-    )
-    assert config.full_scale == 1023
-    text = shown.getvalue()
-    assert "expected a number such as 29.97 or 30000/1001, got 'soon'" in text
-    assert "at most 0.000625 s; units such as us can be added; got '40'" in text
-    assert "at most 0.04 s" in text
-    assert "Here it is less than 625 us." in text
-
-
-def test_end_of_the_answers_writes_nothing(place, frames, monkeypatch, capsys):
-    write_stack("f.npy", frames)
-    monkeypatch.setattr("sys.stdin", Terminal("25\n"))
-    monkeypatch.setattr("sys.stderr", Terminal())
-    assert init("f.npy") == 130
     assert not (place / "camera.toml").exists()
 
 
