@@ -44,7 +44,6 @@ PixelFormat = Literal["gray8", "gray16le", "rgb24", "bgr24"]  # of raw frames in
 BadFrames = Literal["pass", "skip"]
 Channels = Literal["first", "last"] | None
 DetectionMethod = Literal["direct", "bands"]
-ExportFormat = Literal["gcsv", "csv"]
 Mosaic = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
 MotionUnit = Literal["px", "rad", "mrad", "urad", "deg", "arcsec", "rad/s", "deg/s"]
 PriorName = Literal["gaussian", "edges"]

@@ -26,12 +26,12 @@ def place(tmp_path_factory):
 
 
 def test_gcsv_with_a_focal_length(place, tmp_path, capsys):
-    folder, detected, _ = place
+    folder, detected, size = place
     out = tmp_path / "clip.gcsv"
     frames = ("--frames", folder / "frames.tif")
     assert rsvib("export", folder / "vibration.json", out, *frames, "--focal-length", 900, "--json") == 0
     answer = json.loads(capsys.readouterr().out)
-    assert (answer["format"], answer["num_frames"]) == ("gcsv", 2)
+    assert (answer["size"], answer["num_frames"]) == (list(size), 2)
     first = out.read_text().split("t,gx,gy,gz\n")[1].splitlines()[0]
     tone = detected.vibration
     rate = float(tone.amplitude[1, 0] * 2 * np.pi * tone.frequency[1, 0] * torch.cos(tone.phase[1, 0])) / 900
@@ -42,10 +42,10 @@ def test_gcsv_with_a_focal_length(place, tmp_path, capsys):
 
 
 def test_axes_that_are_not_reliable_are_left_out(place, tmp_path, capsys):
-    folder, _, size = place
+    folder, _, _ = place
     data = json.loads((folder / "vibration.json").read_text())
     path, blind = tmp_path / "doubtful.json", {"code": "of a later version", "text": "blind"}
-    options = ("--size", f"{size[0]}x{size[1]}", "--num-frames", 1, "--focal-length", 900)
+    options = ("--frames", folder / "frames.tif[0:1]", "--focal-length", 900)
 
     def pitch(out):  # about x, from the motion along y
         return np.loadtxt(out.read_text().split("t,gx,gy,gz\n")[1].splitlines(), delimiter=",")[:, 1]
@@ -65,9 +65,9 @@ def test_axes_that_are_not_reliable_are_left_out(place, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("vibration.json", "clip.xyz"), "give --format gcsv or csv"),
-        (("vibration.json", "vibration.json", "--format", "csv"), "it is the input"),
-        (("vibration.json", "clip.gcsv", "--focal-length", "900"), "give --frames, or --size and --num-frames"),
+        (("vibration.json", "clip.xyz", "--frames", "frames.tif"), "ends with .gcsv"),
+        (("vibration.json", "vibration.json", "--frames", "frames.tif"), "it is the input"),
+        (("vibration.json", "clip.gcsv", "--focal-length", "900"), "Missing option '--frames'"),
     ],
 )
 def test_errors_are_one_line(place, monkeypatch, capsys, arguments, message):
