@@ -18,7 +18,7 @@ from rsvib_torch.commands.stack_commands import load, print_notes
 from rsvib_torch.commands.terminal import Answer, note, warn, working
 from rsvib_torch.files.atomic import whole_file
 from rsvib_torch.files.reading import Table
-from rsvib_torch.options import FreeMotionOptions, MotionUnit, ProcessStackOptions, TimeUnit
+from rsvib_torch.options import FreeMotionOptions, MotionUnit, ProcessStackOptions
 from rsvib_torch.text import measured_text
 
 if TYPE_CHECKING:
@@ -82,31 +82,16 @@ class KnownOptions(shared.RestoredStack):
     """Options of ``known``."""
 
     motion: Path = option(...)
-    """CSV file with the columns time, x and y; or, without --unit, the angular rates of a gyroscope: a gyroflow log
-    (.gcsv), a GoPro video (.mp4), or CSV with three rates whose names state the unit."""
+    """CSV file with the columns time in s, x and y; or, without --unit, the angular rates of a gyroscope: a gyroflow
+    log (.gcsv), a GoPro video (.mp4), or CSV with three rates whose names state the unit."""
     unit: MotionUnit | None = option(None, show_default="the rates of a gyroscope")
     """Unit of x and y: px, an angle, or an angular rate."""
     focal_length: float | None = option(None, show_default="for a gyroscope, estimated from the frames")
     """Focal length in px; required for angles and angular rates."""
     lens_profile: Path | None = option(None, show_default="a lens without distortion")
     """With a gyroscope: lens profile of Gyroflow (JSON)."""
-    time_unit: TimeUnit = "s"
-    """Unit of the times."""
-    flip_x: bool = False
-    """Positive x moves the image towards smaller x."""
-    flip_y: bool = False
-    """Positive y moves the image towards smaller y."""
     offset: float | None = option(None, show_default="estimated from the frames")
-    """Time of the recording, in s, at the exposure start of the first row of frame 0."""
-    offsets: tuple[float, float] | None = option(
-        None, metavar="LOW HIGH", show_default="all for which the recording covers the frames"
-    )
-    """Smallest and largest time of the recording, in s, at the exposure start of the first row of frame 0, between
-    which it is estimated."""
-    fit_gain: bool = False
-    """Estimate the focal length from the frames as well."""
-    fit_row_time: bool = False
-    """With a gyroscope: estimate the row time from the frames as well."""
+    """With --unit: time of the recording, in s, at the exposure start of the first row of frame 0."""
     ignore: list[str] | None = option(None, metavar="ROWS[,COLUMNS]", show_default="all rows count")
     """Rows of the frames, or a part of them, that do not count in the comparison with the recording, for example 400:
     for a dashboard below row 400, or :60,500: for a sign in a corner; may be given several times."""
@@ -135,88 +120,75 @@ def known(given: KnownOptions) -> Answer:
     frames, and refused if it does not explain them. If the restored frames are judged no better than the input, the
     input is written unchanged, unless --force is given.
     """
-    outputs = [*io.stack_files(given.restored), given.manifest]
     replaces = given.overwrite or "resume" in given.processing
+    outputs = [*io.stack_files(given.restored), given.manifest]
     shared.check_new(outputs, replaces, [*given.inputs, given.motion, given.lens_profile])
     recorded = _recorded(given)
     info, scale, options = given.planned_stack({})
     info, timing = replace(info, full_scale=scale), given.settings.timing
     ignore = stacks.mask_of_regions(given.ignore or (), (info.shape[-2], info.shape[-1]))
     print_notes(info, given.settings)
-    # 1. The motion on the clock of the frames.
     results: dict[str, list[str]] = {}
     data: Table = {"alignment": None, "check": None}
-    if given.offset is None or not isinstance(recorded, rsvib_torch.FreeMotion):
-        camera = None  # the stated lens of a gyroscope
-        if given.lens_profile is not None:
-            camera = rsvib_torch.Camera.from_gyroflow(given.lens_profile, info.shape[-1], info.shape[-2])
-        elif given.unit is None and given.focal_length is not None:
-            camera = rsvib_torch.Camera(given.focal_length)
+    # 1. The motion on the clock of the frames, which is stated or estimated.
+    if isinstance(recorded, rsvib_torch.FreeMotion) and given.offset is not None:
+        placed = _placed(given, recorded, timing, given.offset)
+    else:
+        chosen = gyroscope.AlignOptions(camera=_camera(given), ignore=ignore)
         with working("aligning the recording"):
-            chosen = gyroscope.AlignOptions(
-                camera=camera,
-                offsets=given.offsets,
-                ignore=ignore,
-                fit_gain=given.fit_gain,
-                fit_row_time=given.fit_row_time,
-            )
             found = stacks.align_stack(given.frames, info, timing, recorded, chosen)
         results["Recording on the clock of the frames"] = [found.summary()]
         data["alignment"] = _without_curves(found)
         _refuse(given, found.reasons)
         placed = found.motion
-        if given.fit_row_time and isinstance(found, gyroscope.RotationAlignment):  # times in s stay the same
-            rows = timing.row_time / found.row_time
-            timing = replace(
-                timing,
-                row_time=found.row_time,
-                exposure_rows=rows * timing.exposure_rows,
-                frame_rows=rows * timing.frame_rows,
-                row_time_std=found.row_time_std,
-            )
-    else:
-        placed = recorded.retimed(given.offset)
-        starts = io.timing_from_first_frame(timing, info).frame_starts(info.shape[0])
-        readout = info.shape[int(timing.scan_axis)] * timing.row_time + timing.exposure_time
-        last = float(starts[-1] - starts[0]) + readout
-        if placed.start > 1e-9 or placed.end < last - 1e-9:  # s; rounding of the offset
-            needed = f"the frames need {given.offset:.6g} to {given.offset + last:.6g} s"
-            raise ValueError(f"{given.motion}: covers {recorded.start:.6g} to {recorded.end:.6g} s, {needed}")
     # 2. Whether it explains the offsets of rows; rates were compared by the alignment.
-    compared = isinstance(recorded, rsvib_torch.FreeMotion)
-    check = _check_motion(given, info, timing, placed, ignore) if compared else None
-    if check is not None:
-        results["Motion of the frames"], data["check"] = [check.summary()], _without_curves(check)
+    if isinstance(recorded, rsvib_torch.FreeMotion):
+        check = _check_motion(given, info, timing, placed, ignore)
+        if check is not None:
+            results["Motion of the frames"], data["check"] = [check.summary()], _without_curves(check)
     # 3. Restoration in windows.
-    counts = info.shape[0] > 8
     of_run = given.of_stack(scale, options) | {"force": given.force, "motion": placed}
     of_run |= {name: value for name, value in given.settings.stack.items() if name == "window"} | given.processing
+    counts = info.shape[0] > 8
     with working(f"restoring {given.frames.name}", counts=counts) as progress:
-        run = stacks.process_stack(
-            given.frames, given.restored, timing, **of_run, progress=progress if counts else None
-        )
+        of_run["progress"] = progress if counts else None
+        run = stacks.process_stack(given.frames, given.restored, timing, **of_run)
     results["Restoration"], data["restoration"] = answers.restoration_of(run, given.restored)
     return Answer(results, data, [given.restored, given.manifest])
 
 
 def _recorded(given: KnownOptions) -> rsvib_torch.FreeMotion | rsvib_torch.AngularRates:
-    if given.offset is not None and given.offsets is not None:
-        raise ValueError("--offset states the clock and --offsets limits its estimate: give one of them")
+    """The motion of a CSV file, or the rates of a gyroscope."""
+    if given.unit is not None:
+        if given.lens_profile is not None:
+            raise ValueError("--lens-profile is for a gyroscope, without --unit")
+        return rsvib_torch.read_motion(given.motion, unit=given.unit, focal_length=given.focal_length)
+    if given.offset is not None:
+        raise ValueError("--offset needs --unit; axes and clock of a gyroscope are estimated from the frames")
     if given.lens_profile is not None and given.focal_length is not None:
         raise ValueError("--lens-profile and --focal-length both state the focal length: give one of them")
-    if given.unit is not None:
-        if given.fit_row_time or given.lens_profile is not None:
-            raise ValueError("--fit-row-time and --lens-profile are for a gyroscope, without --unit")
-        signs = (-1.0 if given.flip_x else 1.0, -1.0 if given.flip_y else 1.0)
-        return rsvib_torch.read_motion(
-            given.motion, unit=given.unit, focal_length=given.focal_length, time_unit=given.time_unit, signs=signs
-        )
-    if given.flip_x or given.flip_y or given.offset is not None or given.time_unit != "s":
-        raise ValueError(
-            "--flip-x, --flip-y, --offset and --time-unit are for a CSV file with the columns time, x and y, and need "
-            "--unit; axes and clock of a gyroscope are estimated from the frames"
-        )
     return rsvib_torch.read_gyroscope(given.motion)
+
+
+def _camera(given: KnownOptions) -> rsvib_torch.Camera | None:
+    """The stated lens of a gyroscope."""
+    if given.lens_profile is not None:
+        return rsvib_torch.Camera.from_gyroflow(given.lens_profile, given.info.shape[-1], given.info.shape[-2])
+    return None if given.unit is not None or given.focal_length is None else rsvib_torch.Camera(given.focal_length)
+
+
+def _placed(
+    given: KnownOptions, recorded: rsvib_torch.FreeMotion, timing: rsvib_torch.SensorTiming, offset: float
+) -> rsvib_torch.FreeMotion:
+    """A recording whose clock is stated, if it covers the frames."""
+    info, placed = given.info, recorded.retimed(offset)
+    starts = io.timing_from_first_frame(timing, info).frame_starts(info.shape[0])
+    readout = info.shape[int(timing.scan_axis)] * timing.row_time + timing.exposure_time
+    last = float(starts[-1] - starts[0]) + readout
+    if placed.start > 1e-9 or placed.end < last - 1e-9:  # s; rounding of the offset
+        needed = f"the frames need {offset:.6g} to {offset + last:.6g} s"
+        raise ValueError(f"{given.motion}: covers {recorded.start:.6g} to {recorded.end:.6g} s, {needed}")
+    return placed
 
 
 def _refuse(given: KnownOptions, reasons: tuple[str, ...]) -> None:
