@@ -56,7 +56,7 @@ _EXAMPLES = """
         --motion motion.csv --unit px --offset 0
   rsvib calibrate led.mp4 --frequency 1000 --frame-rate 29.97 \\
         --out camera.toml
-  rsvib calibrate long.png short.png --exposure 0.001 --exposure 0.00025
+  rsvib calibrate clip.mp4 --by-motion --frame-rate 30 --out camera.toml
   rsvib live 0 --config camera.toml --page 8080
   rsvib live rtsp://camera/stream --config camera.toml --out still.mkv \\
         --steady 1

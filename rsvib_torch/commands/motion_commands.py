@@ -238,27 +238,25 @@ class CalibrateOptions:
 
     frames: list[Path] = argument()
     """One or more stacks of frames: TIFF, PNG, video ...; of NAME[100:200] frames 100 to 199."""
-    flicker_frequency: float | None = option(None, "--frequency")
-    """Flicker frequency in Hz; a mains-powered light flickers at twice the mains frequency."""
-    exposure: float | None = option(None, **shared.TIME)
-    """With --by-motion, if known: exposure time, e.g. 1/1000."""
     by_motion: bool = False
     """Use the motion of the camera instead of a light."""
+    flicker_frequency: float | None = option(None, "--frequency")
+    """Flicker frequency in Hz; a mains-powered light flickers at twice the mains frequency."""
+    on_fraction: float | None = None
+    """Duty cycle of a light that is switched on and off; determines the exposure time."""
+    gamma: float | None = option(None, show_default="1")
+    """With --frequency: exponent that makes pixel values proportional to light."""
     row_time: list[float] | None = option(
         None, show_default="a readout within a tenth to the whole of the frame period", **shared.TIME
     )
     """With --by-motion: given twice, the shortest and the longest possible row time, e.g. 10us."""
+    exposure: float | None = option(None, **shared.TIME)
+    """With --by-motion, if known: exposure time, e.g. 1/1000."""
     readout_direction: Literal["forward", "reverse"] | None = option(None, show_default="determined from the frames")
     """With --by-motion, if known: forward if the top row (or left column) is read first, reverse if the last one is."""
     frame_rate: float | None = option(None, **shared.SENSOR_FORMS["frame_rate"])
-    on_fraction: float | None = None
-    """Duty cycle of a light that is switched on and off; determines the exposure time."""
-    light_contrast: float | None = None
-    """Amplitude over mean of a sinusoidal light; determines the exposure time."""
     scan_axis: Literal["y", "x"] = "y"
     """Image axis along which the rows follow each other."""
-    gamma: float = 1.0
-    """Exponent that makes pixel values proportional to light."""
     full_scale: float | None = None
     """Count that corresponds to full scale."""
     out: Path | None = None
@@ -273,52 +271,44 @@ def calibrate(given: CalibrateOptions) -> Answer:
     The readout direction is measured as well. With --by-motion, a row time that is not certain is refused with the
     reason.
     """
-    _check_given(given)
+    light = {"flicker_frequency": given.flicker_frequency, "on_fraction": given.on_fraction, "gamma": given.gamma}
+    motion = {"row_time": None if given.row_time is None else tuple(given.row_time), "exposure_time": given.exposure}
+    motion |= {"readout_direction": given.readout_direction}
+    chosen, others = (motion, light) if given.by_motion else (light, motion)
+    if any(value is not None for value in others.values()):
+        listed = "--frequency, --on-fraction and --gamma are for a flickering light, not for --by-motion"
+        listed = listed if given.by_motion else "--row-time, --exposure and --readout-direction are for --by-motion"
+        raise ValueError(f"{listed}; leave them out")
+    if not given.by_motion and given.flicker_frequency is None:
+        raise ValueError("give --frequency of the flicker, or --by-motion for frames of a vibrating camera")
     paths = given.frames
     if given.out is not None:
         shared.check_file(given.out, given.overwrite, [file for path in paths for file in io.stack_files(path)])
     infos = [io.read_stack_info(path) for path in paths]
     if io.split_range(paths[0])[1] is None and infos[0].shape[0] > _CALIBRATED_FRAMES:
         note(f"the first {_CALIBRATED_FRAMES} of {infos[0].shape[0]} frames are used; NAME[START:END] are others")
-        paths = [path.with_name(f"{path.name}[0:{_CALIBRATED_FRAMES}]") for path in paths[:1]]
-        infos = [io.read_stack_info(path) for path in paths]
+        paths = [paths[0].with_name(f"{paths[0].name}[0:{_CALIBRATED_FRAMES}]")]
+        infos = [io.read_stack_info(paths[0])]
     for sentence in (sentence for info in infos for sentence in io.describe_stack(info, None)):
         note(sentence)
-    frame_rate = given.frame_rate or 0.0
+    of_both: Table = {name: value for name, value in chosen.items() if value is not None}
+    of_both |= {"frame_rate": given.frame_rate, "scan_axis": -1 if given.scan_axis == "x" else -2}
     if given.by_motion and given.frame_rate is None:
-        frame_rate = shared.rate_of_file(paths[0]) or 0.0
-        if not frame_rate:
+        of_both["frame_rate"] = shared.rate_of_file(paths[0])
+        if of_both["frame_rate"] is None:
             raise ValueError("--by-motion needs --frame-rate of the sensor: the row time is found relative to it")
     with working("reading the frames"):
         stack = io.read_stack(paths, full_scale=given.full_scale)
-    axis: Literal[-2, -1] = -1 if given.scan_axis == "x" else -2
+    measure = row_time.calibrate_row_time_by_motion if given.by_motion else row_time.calibrate_row_time
     with working("measuring the motion" if given.by_motion else "measuring the flicker"):
-        if given.by_motion:
-            result = row_time.calibrate_row_time_by_motion(
-                stack,
-                frame_rate=frame_rate,
-                row_time=(given.row_time[0], given.row_time[1]) if given.row_time else None,
-                exposure_time=given.exposure,
-                scan_axis=axis,
-                readout_direction=given.readout_direction,
-            )
-        else:
-            result = row_time.calibrate_row_time(
-                stack,
-                given.flicker_frequency or 0.0,
-                frame_rate=given.frame_rate,
-                on_fraction=given.on_fraction,
-                light_contrast=given.light_contrast,
-                scan_axis=axis,
-                gamma=given.gamma,
-            )
+        result = measure(stack, **of_both)
     if result.row_time is None or result.row_time_std is None or not result.reliable:
         raise ValueError(f"the row time is not certain: {'; '.join(result.reasons)}")
     period: Table = {"frame_rate": None} if result.frame_rows is None else {"frame_rows": result.frame_rows}
     values = {name: getattr(result, name) for name in ("row_time", "row_time_std", "exposure_time")} | period
     values |= {"scan_axis": given.scan_axis, "readout_direction": result.readout_direction}
     table = sensor_toml(values, ["Written by rsvib calibrate.", *result.notes])  # unknown values are comments
-    rows = stack.shape[axis]
+    rows = stack.shape[of_both["scan_axis"]]
     readout = measured_text(1e3 * result.row_time * rows, 1e3 * result.row_time_std * rows)
     steps = ["enter the values that are left open"] * (" = \n" in table)
     if given.out is None:
@@ -334,19 +324,3 @@ def calibrate(given: CalibrateOptions) -> Answer:
         [] if given.out is None else [given.out],
         steps,
     )
-
-
-def _check_given(given: CalibrateOptions) -> None:
-    """Raise an error for options of ``calibrate`` that do not fit a flickering light, or ``--by-motion``."""
-    if not given.by_motion:
-        if given.row_time or given.exposure is not None or given.readout_direction is not None:
-            raise ValueError("--row-time, --exposure and --readout-direction of calibrate are for --by-motion")
-        if given.flicker_frequency is None:
-            raise ValueError("give --frequency of the flicker, or --by-motion for frames of a vibrating camera")
-        return
-    light = {"--frequency": given.flicker_frequency, "--on-fraction": given.on_fraction}
-    for name, value in (light | {"--light-contrast": given.light_contrast}).items():
-        if value is not None:
-            raise ValueError(f"{name} describes a flickering light; leave it out with --by-motion")
-    if given.row_time and len(given.row_time) != 2:
-        raise ValueError("give --row-time twice: the shortest and the longest possible row time")
