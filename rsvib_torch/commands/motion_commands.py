@@ -271,9 +271,14 @@ def calibrate(given: CalibrateOptions) -> Answer:
     The readout direction is measured as well. With --by-motion, a row time that is not certain is refused with the
     reason.
     """
-    light = {"flicker_frequency": given.flicker_frequency, "on_fraction": given.on_fraction, "gamma": given.gamma}
-    motion = {"row_time": None if given.row_time is None else tuple(given.row_time), "exposure_time": given.exposure}
-    motion |= {"readout_direction": given.readout_direction}
+    light: Table = {
+        "flicker_frequency": given.flicker_frequency,
+        "on_fraction": given.on_fraction,
+        "gamma": given.gamma,
+    }
+    limits = None if given.row_time is None else tuple(given.row_time)
+    motion: Table = {"row_time": limits, "exposure_time": given.exposure}
+    motion["readout_direction"] = given.readout_direction
     chosen, others = (motion, light) if given.by_motion else (light, motion)
     if any(value is not None for value in others.values()):
         listed = "--frequency, --on-fraction and --gamma are for a flickering light, not for --by-motion"

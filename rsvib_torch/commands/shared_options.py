@@ -1,7 +1,6 @@
 """Arguments and options that several commands share, and their combination with the configuration file."""
 
 import os
-import re
 import statistics
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -66,14 +65,6 @@ def _axes(text: str) -> str:
     if not set(text.split(",")) <= set(AXES):
         raise typer.BadParameter(f"expected axes such as x,y or x,y,roll,zoom, got {text!r}")
     return text
-
-
-def size_of(text: str, expected: str) -> tuple[int, int]:
-    """Two numbers of px with an x between them, from ``--size``."""
-    match = re.fullmatch(r"([1-9]\d{0,5})x([1-9]\d{0,5})", text.strip().lower())
-    if match is None:
-        raise ValueError(f"--size must be {expected}, got {text!r}")
-    return int(match[1]), int(match[2])
 
 
 TIME: Table = {"parser": seconds, "metavar": "TIME"}  # form of an option
