@@ -131,14 +131,14 @@ def run_step(frames: Path, out: Path, arguments: Sequence[str]) -> str:
 
 
 def steps_after_detection(
-    result: detection.DetectionResult | None, frames: Path, settings: Config, vibration: Path | None = None
+    result: detection.DetectionResult, frames: Path, settings: Config, vibration: Path | None = None
 ) -> list[str]:
-    """What to do after a detection (None for windows): restore with the file ``vibration``, or try another model."""
+    """What to do after a detection: restore with the file ``vibration``, or try another model."""
     steps = []
-    if vibration is not None and (result is None or bool(result.reliable.any())):
+    if vibration is not None and bool(result.reliable.any()):
         restore = ("restore", frames, frames.with_name("restored.tif"), *settings.arguments, "--vibration", vibration)
         steps.append(next_step("restore the frames", *restore))
-    reasons = [] if result is None else [reason for of_axis in result.findings for reason in of_axis]
+    reasons = [reason for of_axis in result.findings for reason in of_axis]
     if any(reason.kind.free_model for reason in reasons):
         motion = ("motion", frames, *settings.arguments, "--out", "motion.csv")
         steps.append(next_step("detect a motion that is not a steady vibration", *motion))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,8 +15,8 @@ from rsvib_torch.commands import answers
 from rsvib_torch.commands import shared_options as shared
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.terminal import Answer, current_output, note, working
-from rsvib_torch.files.atomic import check_writable, whole_folder
-from rsvib_torch.files.reading import Table, check_regular
+from rsvib_torch.files.atomic import whole_folder
+from rsvib_torch.files.reading import Table
 from rsvib_torch.options import DetectStackOptions, RestorationOptions
 from rsvib_torch.text import printable
 
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from rsvib_torch.config import Config
-    from rsvib_torch.motion.detected_vibration import DetectedVibration
 
 
 def load(given: shared.StackCommand, restoration: Table | None = None) -> tuple[Tensor, rsvib_torch.SensorTiming]:
@@ -115,12 +113,14 @@ def detect(given: DetectOptions) -> Answer:
             names = [*answers.write_windows(folder, stored, given.pixel_size), "manifest.json"]
             title = f"Vibration in {len(stored.windows)} windows of {frames.name}"
             answer = answers.windows_answer(title, stored, pixel_size=given.pixel_size)
-            if any(record.followed is not None for record in stored.windows):
-                run = ("run", frames, out / "restored", *settings.arguments)
-                follow = ["--follow"] * (windows.get("follow") is True)
-                answer.next_steps.append(answers.next_step("restore the frames", *run, *follow))
-            else:
-                answer.next_steps += answers.steps_after_detection(None, frames, settings, out / "manifest.json")
+            run = (
+                "run",
+                frames,
+                out / "restored",
+                *settings.arguments,
+                *["--follow"] * (windows.get("follow") is True),
+            )
+            answer.next_steps.append(answers.next_step("restore the frames", *run))
     answers.remove_old(out, (*answers.OF_DETECTION, *answers.OF_WINDOWS), names)
     answer.files += [out / name for name in names]
     return answer
@@ -151,9 +151,7 @@ class RestoreOptions(shared.RestoredStack, shared.RestorationCommand):
     """Options of ``restore``."""
 
     vibration: Path = option(...)
-    """The vibration.json, or manifest.json of windows, written by detect or run."""
-    report: Path | None = None
-    """JSON file to write: whether restoration helped, with the measured values."""
+    """The vibration.json written by detect or run."""
 
 
 def restore_frames(given: RestoreOptions) -> Answer:
@@ -162,58 +160,21 @@ def restore_frames(given: RestoreOptions) -> Answer:
     The result is judged. If the restored frames are judged no better than the input, the input is written
     unchanged, unless --force is given.
     """
-    settings, frames, restored, report = given.settings, given.frames, given.restored, given.report
-    outputs = [*io.stack_files(restored), given.manifest, *([] if report is None else [report])]
-    shared.check_new(outputs, given.overwrite, [*given.inputs, given.vibration])
-    check_regular(given.vibration)
-    with given.vibration.open("rb") as file:
-        of_windows = b'"rsvib stack"' in file.read(200)  # bytes; the format is the first key of either file
+    settings, frames, restored = given.settings, given.frames, given.restored
+    shared.check_new([*io.stack_files(restored), given.manifest], given.overwrite, [*given.inputs, given.vibration])
     info, scale, options = given.planned_stack(given.restoration)
-    detected = None
-    detections: list[DetectedVibration | None] = []
-    if of_windows:
-        if report is not None:
-            raise ValueError("--report needs a vibration.json; the verdict on each window is in its manifest.json")
-        window, detections = _detected_windows(given.vibration, settings.timing)
-    else:
-        timing = io.timing_from_first_frame(settings.timing, info)
-        detected, window = reports.read_vibration(given.vibration, timing), max(2, info.shape[0])
-        stacks.check_stack_fits(info, options, on_gpu=given.torch_device.type != "cpu")
-    if report is not None:
-        check_writable(report)
+    detected = reports.read_vibration(given.vibration, io.timing_from_first_frame(settings.timing, info))
+    stacks.check_stack_fits(info, options, on_gpu=given.torch_device.type != "cpu")
     print_notes(info, settings)
-    common = given.of_stack(scale, options) | {"force": given.force, "window": window}
-    common["given"] = detections or [detected]
-    with working(f"restoring {frames.name}", counts=of_windows) as progress:
-        common["progress"] = progress if of_windows else None
-        run = stacks.process_stack(frames, restored, settings.timing, **common)
+    of_run = given.of_stack(scale, options) | {"force": given.force, "given": [detected]}
+    with working(f"restoring {frames.name}"):
+        run = stacks.process_stack(frames, restored, settings.timing, window=max(2, info.shape[0]), **of_run)
     lines, data = answers.restoration_of(run, restored)
-    files, first = [restored, run.manifest], None if run.first is None else run.first.restoration
-    if detected is None:
-        answer = answers.windows_answer("Vibration", stacks.read_manifest(run.manifest))
-    else:
-        answer = Answer({"Vibration": [detected.summary()]}, {"detection": detected.to_dict()})
-        answer.next_steps += [answers.page_step(frames, frames.with_name("report"), settings)] * run.restored
-    answer.results["Restoration"], answer.data["restoration"] = lines, data
-    if report is not None and first is not None:
-        reports.write_restoration(report, first, options, run.not_kept)
-        files.append(report)
-    answer.files += files
-    return answer
-
-
-def _detected_windows(path: Path, timing: rsvib_torch.SensorTiming) -> tuple[int, list[DetectedVibration | None]]:
-    """Number of frames of the windows of a manifest, and their detections, with the timing of the frames."""
-    manifest = stacks.read_manifest(path)
-    stored = manifest.timing
-    if timing.frame_start_times is None:  # frame times of the file were stored with the detection
-        timing = replace(timing, frame_start_times=stored.frame_start_times)
-    reports.check_same_timing(str(path), stored, timing)
-    window = manifest.settings.get("window")
-    if not isinstance(window, int) or any(record.followed is not None for record in manifest.windows):
-        followed = "its vibration was followed from frame to frame, and is not that of windows"
-        raise ValueError(f"{path}: {followed}; repeat rsvib run, or detect the windows (rsvib detect --window 8)")
-    return window, manifest.detections()
+    return Answer(
+        {"Vibration": [detected.summary()], "Restoration": lines},
+        {"detection": detected.to_dict(), "restoration": data},
+        [restored, given.manifest],
+    )
 
 
 @options

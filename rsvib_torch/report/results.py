@@ -75,7 +75,7 @@ def load_detection(path: Path) -> DetectionResult:
     if data.get("format") != DetectionResult.file_format:
         raise ValueError(
             f"{path}: not a vibration.json, but a file of the format {quoted(data.get('format'))}; give the "
-            "vibration.json, or the manifest.json of windows, that rsvib detect or run wrote"
+            "vibration.json that rsvib detect or run wrote (rsvib run restores windows)"
         )
     result = result_of(DetectionResult, data, path)
     if result.batch_shape:

@@ -93,11 +93,6 @@ def _attempts(place: Path) -> Iterator[tuple[str, Callable[..., None], tuple[obj
             yield command(f"calibrate: {alias}", "calibrate", place / stack, *light)
             camera = ("--row-time", "1e-4", "--exposure", "6e-4", "--frame-rate", 130, "--out", output, config[2])
             yield command(f"init: {alias}", "init", place / stack, *camera)
-    good = (place / "frames.tif", place / "restored.tif")
-    reports = ("frames.tif", "camera.toml", "vibrations.json", "restored.tif", "pngs/../restored.tif")
-    for name in reports:
-        report = ("--report", place / name)
-        yield command(f"restore --report {name}", "restore", *good, *config, *vibration, *report)
     for alias, output in _aliases(place / "camera.toml").items():
         yield command(f"motion: camera.toml, {alias}", "motion", place / "frames.tif", "--out", output, *config)
     for manifest in ("frames.tif", "restored.tif", "pngs/manifest.json"):

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from program import refused, rsvib
+from program import rsvib
 from refusals import refuses
 from small_stack import stop_after
 from truth import Curve, crop, decibel, draw_scene, take_frames
@@ -249,9 +249,6 @@ def test_run_follows_a_vibration_that_changes_without_an_option(place, tmp_path,
     assert "followed from frame to frame, and removed, by rsvib run" in (tmp_path / "page" / "report.html").read_text(
         encoding="utf-8"
     )
-    manifest = tmp_path / "run" / "manifest.json"
-    again = ("restore", place / "frames.npy", tmp_path / "again.npy", *CAMERA, "--vibration", manifest)
-    assert "repeat rsvib run" in refused(capsys, *again)
 
 
 def test_following_is_refused_where_it_is_switched_off(place, tmp_path, capsys):

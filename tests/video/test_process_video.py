@@ -342,9 +342,7 @@ def test_one_command_makes_a_shaky_video_steady(shaky, tmp_path, capsys):
     text = (tmp_path / "page" / "report.html").read_text()
     assert f"Frames {COUNT // 2 - 1} and {COUNT // 2}," in text
     assert "Measured offsets" not in text
-    vibration = ("--vibration", tmp_path / "out" / "manifest.json")
     wrong = {
-        ("restore", shaky, tmp_path / "again.mp4", *CAMERA, *vibration): "is not that of windows; repeat rsvib run",
         steady: "results exist already",
         (*arguments[:3], *CAMERA, "--steady", "1"): "--steady goes with --video",
         (*steady, "--overwrite", "--joint", "3"): "--joint is no option of method='dewarp'",
