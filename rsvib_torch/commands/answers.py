@@ -75,14 +75,13 @@ def windows_answer(
     return answer
 
 
-def warn_of_restoration(result: stacks.RestoredFrames, output: str = "frames") -> None:
+def warn_of_restoration(result: stacks.RestoredFrames) -> None:
     """Print a warning if there is nothing to restore, or if restoration does not help or may not."""
-    kept = "the frames are written unchanged" if output == "frames" else "the page has the input frames only"
-    forced = "writes" if output == "frames" else "shows"
+    kept = "the frames are written unchanged"
     if not result.moves:
         warn(f"no vibration was found that can be removed: {kept}")
     elif result.verdict is not None and result.verdict.overall in ("partly", "worse"):
-        unchanged = "" if result.restored else f"; {kept}, --force {forced} the restored ones"
+        unchanged = "" if result.restored else f"; {kept}, --force writes the restored ones"
         warn(result.verdict.sentence + unchanged)
 
 
@@ -145,12 +144,6 @@ def steps_after_detection(
     if reasons:
         steps.append("follow the remedies that the reasons above name")
     return steps
-
-
-def page_step(frames: Path, out: Path, settings: Config, *more: str | Path) -> str:
-    """The step to write a page about a restored stack."""
-    sentence = "write a page with all figures and the sharpness before and after"
-    return next_step(sentence, "report", frames, out, *settings.arguments, *more)
 
 
 # Files in a folder

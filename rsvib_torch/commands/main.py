@@ -26,7 +26,6 @@ _COMMANDS: dict[str, Callable[..., Answer]] = {  # in the order of the help
     "run": run,
     "detect": stack_commands.detect,
     "restore": stack_commands.restore_frames,
-    "report": stack_commands.report,
     "motion": motion_commands.motion,
     "known": motion_commands.known,
     "calibrate": motion_commands.calibrate,
@@ -38,7 +37,7 @@ _EXAMPLES = """
   rsvib init clip.mp4 --camera "iPhone 12" --exposure 1/500
   rsvib cameras iphone 12
   rsvib cameras gopro --json
-  rsvib run frames.tif results --config camera.toml
+  rsvib run frames.tif results --config camera.toml --report
   rsvib run long.tif results --config camera.toml --memory 2GB --resume
   rsvib detect frames.tif --config camera.toml --out found
   rsvib detect frames.tif --config camera.toml --out found --overwrite --json
@@ -46,8 +45,6 @@ _EXAMPLES = """
         --vibration found/vibration.json
   rsvib restore frames.tif still.tif --config camera.toml \\
         --vibration found/vibration.json --joint all
-  rsvib report frames.tif report --config camera.toml
-  rsvib report chart.tif report --config camera.toml --edge 200,340,60,40
   rsvib motion frames.tif --config camera.toml --out motion.csv
   rsvib motion frames.tif --config camera.toml --out swept.csv --model swept
   rsvib known frames.tif restored.tif --config camera.toml \\

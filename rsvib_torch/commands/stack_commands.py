@@ -1,24 +1,23 @@
-"""Commands that detect and remove vibration: ``detect``, ``restore`` and ``report``."""
+"""The commands ``detect`` and ``restore``, and how all commands read frames."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import rsvib_torch
-from rsvib_torch import detection, io, stacks, video
-from rsvib_torch import frames as preparation
+from rsvib_torch import detection, io, stacks
 from rsvib_torch import report as reports
 from rsvib_torch.checks.validation import options
 from rsvib_torch.commands import answers
 from rsvib_torch.commands import shared_options as shared
-from rsvib_torch.commands.flat_command import Given, argument, option
-from rsvib_torch.commands.terminal import Answer, current_output, note, working
+from rsvib_torch.commands.flat_command import Given, option
+from rsvib_torch.commands.terminal import Answer, note, working
 from rsvib_torch.files.atomic import whole_folder
 from rsvib_torch.files.reading import Table
-from rsvib_torch.options import DetectStackOptions, RestorationOptions
-from rsvib_torch.text import printable
+from rsvib_torch.options import DetectStackOptions
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -38,11 +37,13 @@ def load(given: shared.StackCommand, restoration: Table | None = None) -> tuple[
     return frames.to(given.torch_device), io.timing_from_first_frame(given.settings.timing, given.info)
 
 
-def read_frame(path: Path, index: int, full_scale: float | None) -> Tensor:
-    """A frame of a stack, with 0 for missing pixels."""
+def read_frames(path: Path, indices: Sequence[int], full_scale: float | None) -> Tensor:
+    """Frames of a stack, (T, H, W) or (T, C, H, W) with full scale 1 and 0 for missing pixels."""
+    import numpy as np  # noqa: PLC0415
+
     with closing(io.open_stack(path)) as reader:
-        scale, pixels = full_scale or reader.info.full_scale, reader.frame(index)[None]
-    return io.counts_to_frames(pixels, scale, str(path), reader.info.nodata)[0].nan_to_num(0.0)
+        info, pixels = reader.info, np.stack([reader.frame(index) for index in indices])
+    return io.counts_to_frames(pixels, full_scale or info.full_scale, str(path), info.nodata).nan_to_num(0.0)
 
 
 def print_notes(info: io.StackInfo, config: Config) -> None:
@@ -113,14 +114,9 @@ def detect(given: DetectOptions) -> Answer:
             names = [*answers.write_windows(folder, stored, given.pixel_size), "manifest.json"]
             title = f"Vibration in {len(stored.windows)} windows of {frames.name}"
             answer = answers.windows_answer(title, stored, pixel_size=given.pixel_size)
-            run = (
-                "run",
-                frames,
-                out / "restored",
-                *settings.arguments,
-                *["--follow"] * (windows.get("follow") is True),
-            )
-            answer.next_steps.append(answers.next_step("restore the frames", *run))
+            command = ["run", frames, out / "restored", *settings.arguments]
+            command += ["--follow"] if windows.get("follow") is True else []
+            answer.next_steps.append(answers.next_step("restore the frames", *command))
     answers.remove_old(out, (*answers.OF_DETECTION, *answers.OF_WINDOWS), names)
     answer.files += [out / name for name in names]
     return answer
@@ -175,118 +171,3 @@ def restore_frames(given: RestoreOptions) -> Answer:
         {"detection": detected.to_dict(), "restoration": data},
         [restored, given.manifest],
     )
-
-
-@options
-class ReportOptions(shared.RestorationCommand, shared.VerdictOptions):
-    """Options of ``report``."""
-
-    out: Path = argument()
-    """Folder for report.html and its figures."""
-    edge: list[str] | None = option(None, metavar="EDGE", show_default="edges are searched for")
-    """Slanted edge to measure: TOP,LEFT,HEIGHT,WIDTH in px; may be given several times."""
-    manifest: Path | None = None
-    """The manifest.json of rsvib run or detect with windows: draw amplitude and frequency over the windows. The page of
-    a run that followed the vibration shows the frames of that run, and detects nothing anew."""
-    force: bool = False
-    """Show the restored frames even if they are judged no better than the input."""
-
-
-def report(given: ReportOptions) -> Answer:
-    """Detect, restore, and write an HTML page with all figures.
-
-    Detection, restoration and verdict are those of rsvib run. The page needs no network; figures are also PNG files.
-    """
-    settings, frames, out = given.settings, given.frames, given.out
-    list(map(_edge_box, given.edge or ()))  # errors before anything is computed
-    windows = None if given.manifest is None else stacks.read_manifest(given.manifest)
-    inputs = [*given.inputs, *([] if given.manifest is None else [given.manifest])]
-    answers.check_folder(out, ["report.html"], given.overwrite, inputs)
-    _, _, options = given.planned_restoration(given.restoration)
-    if given.manifest is not None and windows is not None and windows.output is not None and windows.is_followed:
-        made = given.manifest.with_name(windows.output["name"])
-        if windows.totals()["restored"] and made.exists():
-            return _report_of_run(given, windows, made)
-    pixels, timing = load(given, options)
-    detection = _detect(pixels, timing, settings)
-    with working("restoring and judging"):
-        chosen = RestorationOptions(**options)
-        result = stacks.restore_trusted(pixels, timing, detection, chosen, force=given.force, most_pairs=8)
-    answers.warn_of_restoration(result, "page")
-    pattern = options.get("mosaic")
-    steps = []
-    if result.restored:
-        steps = [answers.next_step("write the restored frames", "run", frames, out, *settings.arguments)]
-    elif result.moves:
-        forced = ("report", frames, out.with_name(f"{out.name}_forced"), *settings.arguments, "--force")
-        steps = [answers.next_step("inspect the restored frames nevertheless", *forced)]
-    steps += answers.steps_after_detection(detection, frames, settings)
-    answer = answers.stack_answer(frames, detection, None, result, len(pixels))
-    if windows is not None and windows.output is not None:  # restored by windows, here as a whole
-        title = "Restoration of the page, of one vibration in all frames"
-        answer.results[title] = answer.results.pop("Restoration")
-        answer.results[f"Restoration according to {given.manifest}"] = windows.lines()[1]
-    answer.next_steps += steps
-    page = reports.Report(
-        **_page_head(given, windows),
-        frames=pixels if pattern is None else preparation.colour_frames(pixels, pattern),
-        restored=result.frames,
-        was_restored=result.restored,
-        timing=timing,
-        detection=detection,
-        verdict=result.verdict,
-        left_alone=result.left_alone,
-        options=options,
-        next_steps=tuple(steps),
-    )
-    return _write_page(given, page, answer)
-
-
-def _report_of_run(given: ReportOptions, windows: stacks.StackManifest, made: Path) -> Answer:
-    """The page of a run that followed the vibration: two frames in the middle, before and after it."""
-    import torch  # noqa: PLC0415
-
-    first, scale = max(windows.input["shape"][0] // 2 - 1, 0), windows.settings["full_scale"]
-    of_both = ((given.frames, scale), (made, None if io.is_video(made) else scale))
-    before, after = (torch.stack([read_frame(path, first + n, full) for n in (0, 1)]) for path, full in of_both)
-    answer = answers.windows_answer(f"Vibration in {given.frames.name}", windows)
-    answer.results[f"Restoration according to {given.manifest}"] = windows.lines()[1]
-    page = reports.Report(
-        **_page_head(given, windows),
-        frames=before if windows.margins is None else video.Margins(**windows.margins).cut(before),
-        restored=after,
-        was_restored=True,
-        timing=given.settings.timing,
-        first=first,
-    )
-    return _write_page(given, page, answer)
-
-
-def _page_head(given: ReportOptions, windows: stacks.StackManifest | None) -> Table:
-    """Content of a page apart from the frames."""
-    return {
-        "title": printable(f"Vibration in {given.frames.name}"),
-        "subtitle": printable(f"{given.frames}, camera of {given.settings.source}"),
-        "version": rsvib_torch.__version__,
-        "command": current_output().command,
-        "windows": windows,
-    }
-
-
-def _write_page(given: ReportOptions, page: reports.Report, answer: Answer) -> Answer:
-    """Write a page, and add its files to the answer."""
-    inputs = [*given.inputs, *([] if given.manifest is None else [given.manifest])]
-    with whole_folder(given.out) as folder, working("writing the page"):
-        files = reports.write_report_page(folder, page, list(map(_edge_box, given.edge or ())) or None)
-        shared.check_new([given.out / name for name in files], overwrite=True, inputs=inputs)
-    answer.files += [given.out / name for name in files]
-    return answer
-
-
-def _edge_box(text: str) -> reports.Box:
-    """Position of a slanted edge (top, left, height, width) in px."""
-    numbers = [int(part) for part in text.split(",") if part.strip().isdecimal()]
-    if len(numbers) != 4 or text.count(",") != 3:
-        raise ValueError(f"--edge must be TOP,LEFT,HEIGHT,WIDTH in px, got {text!r}")
-    top, left, height, width = numbers
-    return top, left, height, width

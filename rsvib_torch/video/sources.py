@@ -144,7 +144,7 @@ class PipeSource:
 class FileSource:
     """A file, as ``open_stack`` reads it, with its frame times.
 
-    Frames come as fast as they are processed. ``full_scale`` is the count that means 1.0, if the file does not state it.
+    Frames come as fast as they are processed. ``full_scale`` means 1.0, if the file does not state another one.
     """
 
     def __init__(self, path: Path, timing: SensorTiming, full_scale: float | None = None) -> None:

@@ -1,7 +1,6 @@
 """Every command ends with its answer, as text, as JSON or not at all; help, completion, progress, existing results."""
 
 import inspect
-import itertools
 import json
 import os
 import re
@@ -31,7 +30,7 @@ exposure_rows = 6
 frame_rows = 200
 full_scale = 4095
 """
-COMMANDS = ("run", "detect", "restore", "report", "motion", "known", "calibrate")
+COMMANDS = ("run", "detect", "restore", "motion", "known", "calibrate")
 
 
 @pytest.fixture(scope="module", name="place")
@@ -108,7 +107,6 @@ def test_an_axis_that_is_left_unchanged_is_named_with_the_reason(place, config, 
 WORK = {  # arguments of a command, results that it does not replace, and keys of its answer
     "run": ("frames.tif {}", "manifest.json restored.tif tones.csv", "detection restoration"),
     "detect": ("long.tif --out {} --window 3", "manifest.json windows.json", "windows"),
-    "report": ("frames.tif {}", "report.html", "detection restoration"),
     "motion": ("long.tif --out {}/m.csv", "m.csv", "motion columns"),
     "calibrate": ("led.png --frequency 1000 --out {}/c.toml", "c.toml", "calibration"),
     "restore": ("long.tif {}/r.tif --vibration found/vibration.json", "r.tif", "detection restoration"),
@@ -137,7 +135,7 @@ def test_json_is_the_only_output(command, capsys):
     assert all(Path(file).exists() for file in answer["files"])
     assert answer["warnings"] == []
     assert len(shown.out) < 20_000
-    if arguments[0] in ("run", "report"):
+    if arguments[0] == "run":
         assert len(answer["detection"]["assumptions"]) >= 3
         assert answer["detection"]["sensitivity"].keys() >= {"amplitude_by_frame_rows", "frequency_by_row_time"}
         assert answer["detection"]["reliable"] == [True, True]
@@ -207,7 +205,7 @@ def test_modules_that_are_the_program(module):
 def test_shell_completion():
     environment = os.environ | {"_RSVIB_COMPLETE": "complete_bash", "COMP_WORDS": "rsvib re", "COMP_CWORD": "1"}
     done = subprocess.run([PROGRAM], env=environment, capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["restore", "report"]
+    assert done.stdout.split() == ["restore"]
 
 
 def test_progress_in_a_log_is_a_line_after_twice_the_time(monkeypatch, capsys):
@@ -264,10 +262,9 @@ def test_long_operations_report_their_progress(place, tmp_path):
 
 
 def test_warnings_are_in_the_json_and_printed_quietly(place, config, tmp_path, capsys):
-    commands = {"run": "the frames are written unchanged", "report": "the page has the input frames only"}
-    for (command, kept), option in itertools.product(commands.items(), ("--json", "-q")):
-        warning = f"no vibration was found that can be removed: {kept}"
-        assert rsvib(command, place / "still.tif", tmp_path / f"{command}{option}", *config, option) == 0
+    warning = "no vibration was found that can be removed: the frames are written unchanged"
+    for option in ("--json", "-q"):
+        assert rsvib("run", place / "still.tif", tmp_path / option, *config, option, "--report") == 0
         shown = capsys.readouterr()
         assert shown.err == f"rsvib: warning: {warning}\n"
         assert shown.out == "" if option == "-q" else json.loads(shown.out)["warnings"] == [warning]

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import torch
 from edge_truth import draw_edge, gaussian, mtf50_of, through_pixels
-from program import refused, rsvib
+from program import rsvib
 
 from rsvib_torch.datasets import resolution_chart
 from rsvib_torch.imaging import SensorNoise, simulate_frames
@@ -335,9 +335,8 @@ def make_place(tmp_path_factory):
 
 
 def test_command_writes_a_page(place):
-    frames, config, out, found = (str(place / n) for n in ("chart & <co>.tif", "camera.toml", "out", "windows"))
-    assert rsvib("detect", frames, "--out", found, "--config", config, "--window", 2) == 0
-    arguments = ["report", frames, out, "--config", config, "--manifest", str(place / "windows" / "manifest.json")]
+    frames, config, out = (str(place / name) for name in ("chart & <co>.tif", "camera.toml", "out"))
+    arguments = ["run", frames, out, "--config", config, "--report"]
     assert rsvib(*arguments) == 0
     text = "".join(read(place / "out" / "report.html").text)
     assert "Vibration in chart & <co>.tif" in text
@@ -347,13 +346,3 @@ def test_command_writes_a_page(place):
     assert float(found[2]) == pytest.approx(71.0, rel=0.002)
     assert (place / "out" / "psf.png").exists()
     assert shlex.join(["rsvib", *arguments]) in text
-    assert "1 of 1" in text[text.index("Windows of the stack") :]
-    assert (place / "out" / "windows.png").exists()
-
-
-@pytest.mark.parametrize("option", ["--edge=a,b,c,d", "--edge=0,0,4000,40", "--manifest=no.json"])
-def test_command_refuses_edges_and_manifests_in_one_line(place, capsys, option):
-    out = place / "refused"
-    error = refused(capsys, "report", place / "chart & <co>.tif", out, "--config", place / "camera.toml", option)
-    assert ("edge" if "edge" in option else "no.json") in error
-    assert not out.exists()

@@ -216,7 +216,7 @@ def test_bad_frames_are_written_as_taken_and_the_others_followed(place, tmp_path
 
 
 def test_run_follows_a_vibration_that_changes_without_an_option(place, tmp_path, capsys):
-    assert rsvib("run", place / "frames.npy", tmp_path / "run", *CAMERA) == 0
+    assert rsvib("run", place / "frames.npy", tmp_path / "run", *CAMERA, "--report") == 0
     shown = " ".join(capsys.readouterr().out.split())
     assert "the tones change within" in shown
     assert "followed from frame to frame" in shown

@@ -69,7 +69,6 @@ def test_zarr_that_expands_is_refused_by_every_command(tmp_path, set_free, capsy
         ("run", stack, out),
         ("detect", stack, "--out", out),
         ("detect", stack, "--out", out, "--window", 4),
-        ("report", stack, out),
         ("motion", stack, "--out", tmp_path / "motion-out.csv"),
         ("known", stack, f"{out}.tif", "--motion", tmp_path / "motion.csv", "--unit", "px"),
     ):
