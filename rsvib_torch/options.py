@@ -24,7 +24,6 @@ from rsvib_torch.checks.validation import (
     fields_of,
     options,
 )
-from rsvib_torch.checks.values import refused
 
 if TYPE_CHECKING:
     from rsvib_torch.checks.arrays import ArrayLike
@@ -318,9 +317,8 @@ class RestorationOptions(ExactOptions, BandedOptions, DewarpOptions, RichardsonL
         for group in METHOD_OPTIONS.values():
             for name, field in fields_of(group).items():
                 if name not in names and getattr(self, name) != field.default:
-                    raise refused(
-                        ValueError, name, f"is no option of method={self.method!r}; its options are {', '.join(names)}"
-                    )
+                    of_method = f"method={self.method!r}; its options are {', '.join(names)}"
+                    raise ValueError(f"{name} is no option of {of_method}")
 
 
 @options

@@ -343,7 +343,7 @@ def test_one_command_makes_a_shaky_video_steady(shaky, tmp_path, capsys):
     wrong = {
         steady: "results exist already",
         (*arguments[:3], *CAMERA, "--steady", "1"): "--steady goes with --video",
-        (*steady, "--overwrite", "--joint", "3"): "--joint is no option of method='dewarp'",
+        (*steady, "--overwrite", "--joint", "3"): "joint is no option of method='dewarp'",
         (*steady[:-1], "-1", "--overwrite"): "steady must be at least 0, got -1",
     }
     for command, message in wrong.items():
