@@ -23,13 +23,6 @@ if TYPE_CHECKING:
     from rsvib_torch.motion.timing import SensorTiming
 
 
-def _shell_word(text: str) -> str:
-    r"""A word of a command line; ``$'...'`` where it contains characters that are not printed as they are."""
-    if printable(text) == text:
-        return shlex.quote(text)
-    return "$'" + printable(text.replace("\\", "\\\\").replace("'", "\\'")) + "'"
-
-
 def detection_data(result: detection.DetectionResult) -> Table:
     """A detection without its offset curve."""
     return {name: value for name, value in result.to_dict().items() if name not in ("offsets", "fitted")}
@@ -120,7 +113,7 @@ def restoration_of(run: stacks.StackReport, restored: Path) -> tuple[list[str], 
 
 def next_step(sentence: str, *command: object) -> str:
     """A step: a sentence, and the command that does it, which can be copied into a shell."""
-    return f"{sentence}:\n  {' '.join(['rsvib', *map(_shell_word, map(str, command))])}"
+    return f"{sentence}:\n  {printable(shlex.join(['rsvib', *map(str, command)]))}"
 
 
 def run_step(frames: Path, out: Path, arguments: Sequence[str]) -> str:

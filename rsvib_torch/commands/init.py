@@ -2,8 +2,6 @@
 
 import math
 import textwrap
-from collections.abc import Mapping
-from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -99,8 +97,8 @@ def _row_time_of(camera: str, info: "StackInfo", values: Table) -> tuple[dict[st
 
 def _describe_camera(path: Path, given: Table, camera: str | None) -> str:
     """Text of the configuration file: values of the command line and of the file of the frames."""
-    with working(f"reading {path}"), closing(io.open_stack(path)) as reader:
-        info, first = reader.info, reader.frame(0)
+    with working(f"reading {path}"):
+        info = io.read_stack_info(path)
     size = f"{info.shape[0]} frames of {info.shape[-2]} x {info.shape[-1]} px (height x width), {info.dtype}"
     note(f"{path}: {size}")
     values, rows = dict(given), info.shape[-1 if given.get("scan_axis") == "x" else -2]
@@ -111,7 +109,6 @@ def _describe_camera(path: Path, given: Table, camera: str | None) -> str:
     elif stated is not None and not math.isclose(stated, given["frame_rate"], rel_tol=0.01):
         warn(f"--frame-rate is {given['frame_rate']:g}, the times in the file give {stated:.6g}")
     source, proposal = None, ""
-    likely: dict[str, float] = {}
     if camera is not None:
         known, source = _row_time_of(camera, info, values)
         values |= known
@@ -122,13 +119,7 @@ def _describe_camera(path: Path, given: Table, camera: str | None) -> str:
             proposal = f' The file names its camera: --camera "{info.camera}" takes {proposed}.'
         except ValueError as error:
             proposal = f" The file names its camera, {info.camera}: {error}."
-    if info.is_integer and info.full_scale is None:
-        # the largest count of the bit depth that the frame uses; multiples of 16 are 12 bits shifted by 4
-        import numpy as np  # noqa: PLC0415
-
-        step = max(int(np.gcd.reduce(first.ravel())), 1)
-        likely["full_scale"] = float(((1 << max(int(first.max()) // step, 255).bit_length()) - 1) * step)
-    elif info.dtype != "uint8" and info.full_scale is not None:
+    if info.dtype != "uint8" and info.full_scale is not None:
         values.setdefault("full_scale", info.full_scale)
     track = gyroscope.read_camera_track(path)
     if track is not None and "exposure_time" not in values and (exposure := stated_exposure(path)) is not None:
@@ -138,7 +129,7 @@ def _describe_camera(path: Path, given: Table, camera: str | None) -> str:
             f"the camera has stabilised the frames (IORI in the track of the video): it turned them by up to "
             f"{math.degrees(track.turned):.2g} degrees, and their rows no longer show its motion"
         )
-    _check_complete(values, rows, likely, proposal)
+    _check_complete(values, info, rows, proposal)
     _check_timing(read_config(None, sensor=values).timing, rows)
     head = [
         f"Camera of {printable(path.name)}: {size}. Written by rsvib init.",
@@ -153,16 +144,16 @@ def _describe_camera(path: Path, given: Table, camera: str | None) -> str:
     return sensor_toml({name: values[name] for name in order if name in values}, head)
 
 
-def _check_complete(values: Table, rows: int, likely: Mapping[str, float], proposal: str) -> None:
+def _check_complete(values: Table, info: "StackInfo", rows: int, proposal: str) -> None:
     """Raise an error that names the values that are missing, with what states each of them."""
     needed = {"frame_rate": "--frame-rate", "row_time": "--row-time", "exposure_time": "--exposure"}
-    needed |= dict.fromkeys(likely, "--full-scale")
+    needed |= {"full_scale": "--full-scale"} if info.is_integer and info.full_scale is None else {}
     mistakes = []
     for name in (name for name in needed if name not in values):
         hint = f"{needed[name]} is missing. {_HINTS[name]}"
         if name == "row_time" and values.get("frame_rate"):
             hint += f" Here it is less than {1e6 / (values['frame_rate'] * rows):.4g} us.{proposal}"
-        mistakes.append(hint + (f" Frame 0 indicates {likely[name]:g}." if name in likely else ""))
+        mistakes.append(hint)
     if mistakes:
         raise MistakesError(mistakes)
 

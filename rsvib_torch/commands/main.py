@@ -74,16 +74,7 @@ for _name, _function in _COMMANDS.items():
         context_settings=_SETTINGS,
     )(flat_command(_name, _function))
 
-_NO_MEMORY = "not enough memory for a stack of this size: process fewer frames at a time"
-# Lines that replace errors without a message for users, by a part of their type and text.
-_REPLACED = {
-    "RecursionError": "the input is nested too deeply",
-    "can't start new thread": "the system cannot start another thread: use fewer workers, or raise the limit of "
-    "processes (ulimit -u)",
-    "MemoryError": _NO_MEMORY,
-    "allocate": _NO_MEMORY,
-    "out of memory": _NO_MEMORY,
-}
+_OUT_OF_MEMORY = ("MemoryError", "allocate", "out of memory")  # parts of the types and texts of such errors
 _INTERRUPTED = 130  # exit code of typer after Ctrl-C; older versions raise Abort
 
 
@@ -134,8 +125,9 @@ def _lines_of(error: Exception) -> Sequence[str]:
         several = "; give a sequence of files as their folder" if "unexpected extra argument" in message else ""
         return [f"{message}{several}"]
     text = f"{type(error).__name__}: {' '.join(str(error).split())[:500]}"
-    replaced = [line for part, line in _REPLACED.items() if part in text]
-    return replaced[:1] or [f"unexpected {text} (--debug prints the traceback)"]
+    if any(part in text for part in _OUT_OF_MEMORY):
+        return ["not enough memory for a stack of this size: process fewer frames at a time"]
+    return [f"unexpected {text} (--debug prints the traceback)"]
 
 
 def main() -> None:

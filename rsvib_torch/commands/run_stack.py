@@ -109,15 +109,10 @@ def run(given: RunOptions) -> Answer:
 
 
 def _name_of_output(given: RunOptions) -> str:
-    """Name of the restored stack, after checks of the options that belong together."""
+    """Name of the restored stack."""
     output = given.output.removesuffix("/")
     if given.moved and not given.video:
         raise ValueError(f"--{next(iter(given.moved)).replace('_', '-')} goes with --video")
-    if "lens_profile" in given.moved and "gyroscope" not in given.moved:
-        raise ValueError("--lens-profile goes with --gyroscope")
-    if given.require_reliable and "gyroscope" in given.moved:
-        problem = "does not go with --gyroscope, which searches for no tones; leave one of them out"
-        raise ValueError(f"--require-reliable {problem}")
     if given.video:
         if output != "restored.tif":
             raise ValueError(f"--video and --output {output} are two names for the restored stack; give one of them")
@@ -189,17 +184,10 @@ def _process_video(
 ) -> tuple[stacks.StackReport, _Shown]:
     """Process a video from frame to frame; two frames near its begin are shown."""
     settings, frames, restoration = given.settings, given.frames, common["restoration"]
-    changed = [name for name, value in given.windows.items() if value not in (False, "pass")]
-    changed += [name for name in ("scheduler", "compression") if name in given.processing]
-    changed += ["optics_sigma" if name == "optics" else name for name in stacks.options_of_windows(restoration)]
-    refused = ", ".join(f"--{name.replace('_', '-')}" for name in changed)
-    if refused:
-        remedy = "give --output restored.mp4 instead of --video, which processes windows"
-        raise ValueError(f"{refused} cannot be used with --video, which follows the frames one by one; {remedy}")
     if {**settings.restoration, **given.restoration}.get("saturation") is None:
         restoration.pop("saturation", None)  # that of integer formats
     manifest = given.out / "manifest.json"
-    of_run = common | given.moved | given.processing | {"manifest": manifest}
+    of_run = common | given.moved | given.windows | given.processing | {"manifest": manifest}
     with working(f"restoring {frames.name}", counts=True) as progress:
         result = video.process_video(frames, restored, settings.timing, **of_run, progress=progress)
     stored = stacks.read_manifest(manifest)

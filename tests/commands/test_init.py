@@ -70,14 +70,12 @@ def test_frame_times_and_full_scale_of_the_file(place, frames, capsys):
     assert "--frame-rate is 50, the times in the file give 25" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("factor", "likely"), [(1, "4095"), (16, "65520")])
-def test_unknown_full_scale_is_suggested(place, frames, capsys, factor, likely):
-    np.save("f.npy", (frames * 4000).numpy().astype(np.uint16) * np.uint16(factor))
+def test_unknown_full_scale_is_required(place, frames, capsys):
+    np.save("f.npy", (frames * 4000).numpy().astype(np.uint16))
     error = refused(capsys, "init", "f.npy", *TIMES, *RATE)
     assert error.startswith("rsvib: error: --full-scale is missing.")
-    assert f"Frame 0 indicates {likely}." in error
-    assert init("f.npy", *TIMES, *RATE, "--full-scale", likely) == 0
-    assert read_config(place / "camera.toml").full_scale == float(likely)
+    assert init("f.npy", *TIMES, *RATE, "--full-scale", 4095) == 0
+    assert read_config(place / "camera.toml").full_scale == 4095
 
 
 def test_missing_values_are_explained_in_one_line_each(place, frames, capsys):

@@ -101,9 +101,6 @@ def test_a_required_axis_that_is_not_reliable_is_exit_code_3(place, tmp_path, ca
     motion = ("motion", tmp_path / "noise.tif[6:10]", *options, "--search", 6, "--model", "swept")
     assert rsvib(*motion, "--out", tmp_path / "motion.csv", "--require-reliable", "x") == 3
     assert "expected axes such as x,y" in refused(capsys, *found, "--require-reliable", "z")
-    video = ("run", place / "frames.tif", tmp_path / "v", *options, "--video", "--gyroscope", "auto")
-    video = (*video, "--require-reliable", "x")
-    assert "--require-reliable does not go with --gyroscope" in refused(capsys, *video)
 
 
 def test_interrupted_run_is_resumed_or_refused(place, tmp_path, capsys, monkeypatch):
