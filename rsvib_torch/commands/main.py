@@ -13,7 +13,6 @@ import typer
 import rsvib_torch
 from rsvib_torch.checks.validation import MistakesError
 from rsvib_torch.commands import motion_commands, stack_commands
-from rsvib_torch.commands.export_command import export
 from rsvib_torch.commands.flat_command import flat_command
 from rsvib_torch.commands.init import cameras, init
 from rsvib_torch.commands.live_command import live_session
@@ -30,7 +29,6 @@ _COMMANDS: dict[str, Callable[..., Answer]] = {  # in the order of the help
     "known": motion_commands.known,
     "calibrate": motion_commands.calibrate,
     "live": live_session,
-    "export": export,
 }
 _EXAMPLES = """
   rsvib init frames.tif --row-time 14.6us --exposure 1/500 --frame-rate 29.97
@@ -57,8 +55,6 @@ _EXAMPLES = """
   rsvib live 0 --config camera.toml --page 8080
   rsvib live rtsp://camera/stream --config camera.toml --out still.mkv \\
         --steady 1
-  rsvib export found/vibration.json clip.gcsv --frames clip.mp4 \\
-        --focal-length 1800
 """
 _SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 120}  # characters
 
