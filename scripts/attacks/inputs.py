@@ -81,7 +81,6 @@ def _attempts(place: Path) -> Iterator[tuple[str, Callable[..., None], tuple[obj
     for alias, out in folders.items():
         yield command(f"run pngs: {alias}", "run", place / "pngs", out, *config)
         yield command(f"detect pngs: {alias}", "detect", place / "pngs", "--out", out, *config)
-        yield command(f"detect in windows: {alias}", "detect", place / "pngs", "--out", out, "--window", 3, *config)
         yield command(f"page of pngs: {alias}", "run", place / "pngs", out, "--report", *config)
     for stack in ("frames.tif", "frames.npy", "frames.raw", "frames.mkv"):
         arguments = (place / stack, place, "--output", stack, *config)

@@ -105,7 +105,7 @@ def test_an_axis_that_is_left_unchanged_is_named_with_the_reason(place, config, 
 
 WORK = {  # arguments of a command, results that it does not replace, and keys of its answer
     "run": ("frames.tif {}", "manifest.json restored.tif tones.csv", "detection restoration"),
-    "detect": ("long.tif --out {} --window 3", "manifest.json windows.json", "windows"),
+    "detect": ("long.tif --out {}", "vibration.json tones.csv", "detection"),
     "motion": ("long.tif --out {}/m.csv", "m.csv", "motion columns"),
     "calibrate": ("led.png --frequency 1000 --out {}/c.toml", "c.toml", "calibration"),
     "restore": ("long.tif {}/r.tif --vibration found/vibration.json", "r.tif", "detection restoration"),

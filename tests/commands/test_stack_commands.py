@@ -69,26 +69,19 @@ def test_run_of_a_long_stack(place, tmp_path, capsys):
     assert 1 < gain["lowest"] <= gain["highest"] < 40
 
 
-def test_detect_in_windows(place, tmp_path, capsys):
-    options, frames = ("--config", place / "camera.toml"), place / "frames.tif"
-    assert rsvib("detect", frames, *options, "--out", tmp_path / "found", "--memory", "1GB") == 0
-    names = ["manifest.json", "tones.csv", "windows.json", "windows.png"]
-    assert sorted(path.name for path in (tmp_path / "found").iterdir()) == names
-    for vibration, message in (
-        (tmp_path / "found" / "manifest.json", "rsvib run restores windows"),
-        (tmp_path / "found" / "windows.png", "not a vibration.json"),
-    ):
-        arguments = (frames, tmp_path / "o.tif", *options, "--vibration", vibration)
-        assert message in refused(capsys, "restore", *arguments)
+def test_files_that_are_no_vibration_are_refused(place, tmp_path, capsys):
+    for vibration, message in (("manifest.json", "rsvib run restores windows"), ("windows.png", "not a vib")):
+        options = ("--config", place / "camera.toml", "--vibration", place / "out" / vibration)
+        assert message in refused(capsys, "restore", place / "frames.tif", tmp_path / "o.tif", *options)
     assert not (tmp_path / "o.tif").exists()
 
 
 def test_a_required_axis_that_is_not_reliable_is_exit_code_3(place, tmp_path, capsys):
     """In one window or in several; the results are those without the option. Other windows may be reliable."""
-    options, detect = ("--config", place / "camera.toml"), ("detect", place / "frames.tif")
-    for window in (4, 13):
-        found = (*detect, *options, "--window", window, "--overwrite", "--out", tmp_path / "found")
-        assert rsvib(*found, "--require-reliable", "x,y") == 0
+    options, found = ("--config", place / "camera.toml"), tmp_path / "found"
+    assert rsvib(*command(place, found, "--require-reliable", "x,y")) == 0
+    found = ("detect", place / "frames.tif", *options, "--overwrite", "--out", found)
+    assert rsvib(*found, "--require-reliable", "x,y") == 0
     counts = tifffile.imread(place / "frames.tif")
     counts[6:] = np.random.default_rng(0).integers(0, 4095, counts[6:].shape)
     tifffile.imwrite(tmp_path / "noise.tif", counts, photometric="minisblack", metadata=None)

@@ -13,7 +13,7 @@ from small_stack import stop_after
 from truth import Curve, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
-from rsvib_torch.stacks import read_manifest
+from rsvib_torch.stacks import detect_stack, read_manifest
 
 TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=12, frame_rows=500)
 CAMERA = ["--row-time", "100us", "--exposure", "1.2ms", "--frame-rate", "20"]
@@ -181,9 +181,8 @@ def test_two_steady_tones_near_the_frame_rate_are_not_reliable_and_wrong():
 
 
 def test_windows_state_the_vibration_of_their_frames(place, tmp_path):
-    options = ("--window", 14, "--follow", "--out", tmp_path / "found")
-    assert rsvib("detect", place / "frames.npy[0:20]", *CAMERA, *options) == 0
-    manifest = read_manifest(tmp_path / "found" / "manifest.json")
+    detect_stack(place / "frames.npy[0:20]", tmp_path / "manifest.json", TIMING, window=14, follow=True)
+    manifest = read_manifest(tmp_path / "manifest.json")
     assert len(manifest.detections()) == 20
     assert [frame for record in manifest.windows for frame in record.followed] == list(range(20))
     table = manifest.table()
