@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,8 +16,6 @@ from rsvib_torch.files.reading import Table
 from rsvib_torch.text import AXES, number_of, printable, wrapped
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from rsvib_torch.config import Config
     from rsvib_torch.motion.detected_vibration import DetectedVibration
     from rsvib_torch.motion.timing import SensorTiming
@@ -160,16 +158,6 @@ def remove_old(folder: Path, results: Iterable[str], names: Iterable[str]) -> No
         (folder / name).unlink(missing_ok=True)
 
 
-def draw_safely(path: Path, draw: Callable[[], Figure]) -> list[str]:
-    """Draw a figure and return its name; a warning if that fails, because the results do not depend on figures."""
-    try:
-        reports.save_figure(draw(), path)
-    except Exception as error:
-        warn(f"{path.name} is not drawn: {' '.join(str(error).split()) or type(error).__name__}")
-        return []
-    return [path.name]
-
-
 def write_detection(
     folder: Path, result: detection.DetectionResult, timing: SensorTiming, pixel_size: float | None = None
 ) -> list[str]:
@@ -178,12 +166,12 @@ def write_detection(
         reports.write_vibration(folder / "vibration.json", result, timing)
         reports.write_table(folder / "tones.csv", result, pixel_size=pixel_size)
         reports.write_offsets(folder / "offsets.csv", result)
-        drawn = draw_safely(folder / "offsets.png", lambda: reports.offset_figure(result))
+        reports.save_figure(reports.offset_figure(result), folder / "offsets.png")
     with working("computing the spectrum"):
         spectrum = result.spectrum()
         reports.write_table(folder / "spectrum.csv", spectrum, pixel_size=pixel_size)
-        drawn += draw_safely(folder / "spectrum.png", spectrum.plot)
-    return [*drawn, "vibration.json", "tones.csv", "offsets.csv", "spectrum.csv"]
+        reports.save_figure(spectrum.plot(), folder / "spectrum.png")
+    return ["offsets.png", "spectrum.png", "vibration.json", "tones.csv", "offsets.csv", "spectrum.csv"]
 
 
 def write_windows(folder: Path, manifest: stacks.StackManifest, pixel_size: float | None = None) -> list[str]:
@@ -192,9 +180,10 @@ def write_windows(folder: Path, manifest: stacks.StackManifest, pixel_size: floa
     with working("drawing the windows"):
         write_json(folder / "windows.json", {"format": "rsvib windows", "version": 1, **manifest.totals()})
         reports.write_table(folder / "tones.csv", manifest, pixel_size=pixel_size)
-        # otherwise, no tones are searched for
-        drawn = draw_safely(folder / "windows.png", manifest.plot) if manifest.gyroscope is None else []
-    return [*drawn, "windows.json", "tones.csv"]
+        if manifest.gyroscope is not None:  # no tones are searched for
+            return ["windows.json", "tones.csv"]
+        reports.save_figure(manifest.plot(), folder / "windows.png")
+    return ["windows.png", "windows.json", "tones.csv"]
 
 
 def note_lost(path: Path, names: Sequence[str]) -> None:

@@ -90,7 +90,8 @@ def run(given: RunOptions) -> Answer:
         drawn = []
         if len(shown.after):
             with working("drawing the frames"):
-                drawn = answers.draw_safely(folder / "before_after.png", lambda: _comparison(shown))
+                reports.save_figure(_comparison(shown), folder / "before_after.png")
+            drawn = ["before_after.png"]
         names = [output, *drawn, "manifest.json"] if followed else [*drawn, output, "manifest.json"]
         answer = _describe(folder, given, result, shown, names)
         if given.report:

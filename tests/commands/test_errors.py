@@ -73,20 +73,6 @@ def test_functions_raise_errors_of_the_program_unchanged(tmp_path, failing):
         process_stack(failing(KeyError("row")), tmp_path / "b.npy", TIMING)
 
 
-def test_figures_that_cannot_be_drawn_are_a_warning(camera, monkeypatch, capsys):
-    def fail(*_, **__):
-        raise OverflowError("the figure is too large")
-
-    monkeypatch.setattr("rsvib_torch.report.save_figure", fail)
-    assert rsvib("run", "frames.tif", "results", *camera) == 0
-    shown = capsys.readouterr().err
-    for name in ("before_after.png", "offsets.png"):
-        assert f"rsvib: warning: {name} is not drawn: the figure is too large\n" in shown
-    names = set(os.listdir("results"))
-    assert {"restored.tif", "manifest.json", "vibration.json", "offsets.csv"} <= names
-    assert not any(name.endswith(".png") for name in names)
-
-
 def test_names_of_files_are_escaped_and_kept(camera, capsysbinary):
     name = os.fsdecode(b"a\xff\xfe it's $HOME" + "red\x1b[31m line\nbreak \u202etxt".encode())
     os.rename("frames.tif", f"{name}.tif")
