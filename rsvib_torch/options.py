@@ -252,7 +252,7 @@ class ExactOptions(JointOptions):
     """Colours of the pixels (0, 0), (0, 1), (1, 0), (1, 1) of raw frames (T, H, W) or (T, 1, H, W) behind colour
     filters: ``"RGGB"``, ``"BGGR"``, ``"GRBG"`` or ``"GBRG"``. The restored frames have three channels R, G, B, see
     ``restore_mosaic``."""
-    optics: OpticsOptions | None = Field(default=None, json_schema_extra=COMMAND_LINE)
+    optics: OpticsOptions | None = None
     """Optics of the camera, pixel included: the restored frames are as sharp as from a camera with pixels of the
     restored grid behind a Gaussian of half a pixel, ``Optics(sigma=0.5 / scale, pixel=1 / scale)``, where noise allows
     it, see ``sharpened``. None: the restored frames have the sharpness of the camera at rest."""

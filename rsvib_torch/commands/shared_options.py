@@ -209,13 +209,6 @@ class RestorationCommand(StackCommand):
                     "frames (of each window).",
                     "kind": str,
                 },
-                "optics": {
-                    "names": ["--optics-sigma"],
-                    "text": "Standard deviation of the Gaussian blur of the lens in px, before pixels without gaps: "
-                    "restored frames are sharpened to half a point of their grid. Section [restoration.optics] "
-                    "describes other optics.",
-                    "kind": float,
-                },
             },
         ),
     ]
@@ -318,8 +311,6 @@ def _restoration_options(info: "StackInfo", full_scale: float | None, options: T
     method: str = (options | given).get("method", "exact")
     if method != options.get("method", "exact"):  # other options belong to the configured method
         options = {name: value for name, value in options.items() if name in ("saturation", *method_options(method))}
-    if "optics" in given:
-        given["optics"] = {"pixel": 1.0, **options.get("optics", {}), "sigma": given["optics"]}
     if "joint" in given:
         if given["joint"] != "all" and not (given["joint"].isdecimal() and int(given["joint"]) >= 1):
             raise ValueError(f"--joint must be 'all' or a number of frames, got {given['joint']!r}")
