@@ -174,9 +174,6 @@ class StackCommand(CameraOptions, DeviceOptions):
         if stated is None and configured is None:
             unknown = f"{self.frames}: the full scale of its {self.info.dtype} counts is not known"
             raise ValueError(f"{unknown}: give --full-scale, e.g. 4095 for 12 bits, or full_scale in [sensor]")
-        if stated is not None and self.info.dtype != "uint8" and configured not in (None, stated):
-            both = f"{stated:g} in the file and {configured:g} in the configuration"
-            raise ValueError(f"{self.frames}: the full scale is {both}; choose one with --full-scale")
         return configured if stated is None else stated
 
     @property

@@ -1,8 +1,6 @@
 """Terminal output: progress, the answer of a command as text or JSON, and warnings and errors in one line each."""
 
-import os
 import shlex
-import sys
 import textwrap
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -25,7 +23,7 @@ from rich.progress import (
 from rsvib_torch.execution.progress import listening
 from rsvib_torch.files.reading import Table
 from rsvib_torch.results.reason import options_of_the_program
-from rsvib_torch.text import json_text, printable, shortened, wrapped
+from rsvib_torch.text import json_text, one_line, printable, shortened, wrapped
 
 
 @dataclass
@@ -71,13 +69,7 @@ def current_output() -> Output:
 
 def print_line(message: str) -> None:
     """Print a text to standard output; long lines are not wrapped, and control codes are escaped."""
-    try:
-        print(printable(message, lines=True), flush=True)
-    except OSError as error:  # as in a pipe whose reader has ended
-        # what is left in the buffer would fail again at the exit
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        problem = f"the answer cannot be written to standard output ({error.strerror})"
-        raise OSError(f"{problem}; the files are complete") from error
+    typer.echo(printable(message, lines=True))
 
 
 def show_answer(command: str, answer: Answer) -> None:
@@ -133,7 +125,7 @@ def warnings_in_one_line() -> Iterator[None]:
     shown: set[str] = set()
 
     def show(message: object, *_: object, **__: object) -> None:
-        line = " ".join(str(message).split())
+        line = one_line(message)
         if line not in shown:
             shown.add(line)
             warn(line)
