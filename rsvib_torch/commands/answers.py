@@ -19,6 +19,16 @@ if TYPE_CHECKING:
     from rsvib_torch.config import Config
     from rsvib_torch.motion.detected_vibration import DetectedVibration
     from rsvib_torch.motion.timing import SensorTiming
+    from rsvib_torch.results.presentation import Result
+
+
+_CURVES = {"motion", "times", "displacement", "offsets", "residual", "light", "fitted_light", "measured", "predicted"}
+
+
+def without_curves(result: Result) -> Table:
+    """The values of a result without its curves, which have a value for every row or knot."""
+    curves = _CURVES | ({"std"} if isinstance(result, detection.MotionDetection) else set())
+    return {name: value for name, value in result.to_dict().items() if name not in curves}
 
 
 def detection_data(result: detection.DetectionResult) -> Table:

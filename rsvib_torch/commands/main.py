@@ -12,10 +12,12 @@ import typer
 
 import rsvib_torch
 from rsvib_torch.checks.validation import MistakesError
-from rsvib_torch.commands import motion_commands, stack_commands
+from rsvib_torch.commands import stack_commands
+from rsvib_torch.commands.calibrate_command import calibrate
 from rsvib_torch.commands.flat_command import flat_command
 from rsvib_torch.commands.init import cameras, init
 from rsvib_torch.commands.live_command import live_session
+from rsvib_torch.commands.restore_command import restore
 from rsvib_torch.commands.run_stack import run
 from rsvib_torch.commands.terminal import Answer, error_line, print_line, running, warnings_in_one_line
 
@@ -24,10 +26,9 @@ _COMMANDS: dict[str, Callable[..., Answer]] = {  # in the order of the help
     "cameras": cameras,
     "run": run,
     "detect": stack_commands.detect,
-    "restore": stack_commands.restore_frames,
-    "motion": motion_commands.motion,
-    "known": motion_commands.known,
-    "calibrate": motion_commands.calibrate,
+    "restore": restore,
+    "motion": stack_commands.motion,
+    "calibrate": calibrate,
     "live": live_session,
 }
 _EXAMPLES = """
@@ -41,14 +42,10 @@ _EXAMPLES = """
   rsvib detect frames.tif --config camera.toml --out found --overwrite --json
   rsvib restore frames.tif restored.tif --config camera.toml \\
         --vibration found/vibration.json
-  rsvib restore frames.tif still.tif --config camera.toml \\
-        --vibration found/vibration.json --joint all
   rsvib motion frames.tif --config camera.toml --out motion.csv
   rsvib motion frames.tif --config camera.toml --out swept.csv --model swept
-  rsvib known frames.tif restored.tif --config camera.toml \\
+  rsvib restore frames.tif restored.tif --config camera.toml \\
         --motion gyroscope.csv --unit rad/s --focal-length 1800
-  rsvib known frames.tif restored.tif --config camera.toml \\
-        --motion motion.csv --unit px --offset 0
   rsvib calibrate led.mp4 --frequency 1000 --frame-rate 29.97 \\
         --out camera.toml
   rsvib calibrate clip.mp4 --by-motion --frame-rate 30 --out camera.toml

@@ -214,28 +214,6 @@ class RestorationCommand(StackCommand):
 
 
 @options
-class RestoredStack(StackCommand):
-    """A command that writes a restored stack of a name, and its manifest beside it."""
-
-    restored: Path = argument()
-    """Stack to write, with the data type and full scale of the input. The extension selects the format; .mp4 and .mkv
-    are videos with the time stamps and the sound of the input."""
-
-    @property
-    def manifest(self) -> Path:
-        """What was detected and restored in each window."""
-        return self.restored.with_name(f"{self.restored.name}.manifest.json")
-
-    def planned_stack(self, given: Mapping[str, object]) -> "tuple[StackInfo, float | None, Table]":
-        """``planned_restoration``, of which the restored stack can be written."""
-        info, scale, options = self.planned_restoration(given)
-        shape = info.restored_as(options.get("scale", 1), options.get("mosaic")).shape
-        shape = (1, *shape[1:]) if options.get("joint") is True else shape
-        io.check_stack_target(self.restored, shape, dtype=info.dtype, full_scale=scale, like=info)
-        return info, scale, options
-
-
-@options
 class PixelSizeOptions:
     """Units of length."""
 

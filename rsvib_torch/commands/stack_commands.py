@@ -1,11 +1,11 @@
-"""The commands ``detect`` and ``restore``, and how all commands read frames."""
+"""The commands ``detect`` and ``motion``, and how all commands read frames."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import rsvib_torch
 from rsvib_torch import detection, io, stacks
@@ -13,10 +13,11 @@ from rsvib_torch import report as reports
 from rsvib_torch.checks.validation import options
 from rsvib_torch.commands import answers
 from rsvib_torch.commands import shared_options as shared
-from rsvib_torch.commands.flat_command import option
+from rsvib_torch.commands.flat_command import Given, option
 from rsvib_torch.commands.terminal import Answer, note, working
 from rsvib_torch.files.atomic import whole_folder
 from rsvib_torch.files.reading import Table
+from rsvib_torch.options import FreeMotionOptions
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -24,12 +25,12 @@ if TYPE_CHECKING:
     from rsvib_torch.config import Config
 
 
-def load(given: shared.StackCommand, restoration: Table | None = None) -> tuple[Tensor, rsvib_torch.SensorTiming]:
-    """Read a stack that is processed as a whole, if the memory suffices for it and for the restoration that follows.
+def load(given: shared.StackCommand) -> tuple[Tensor, rsvib_torch.SensorTiming]:
+    """Read a stack that is processed as a whole, if the memory suffices for it.
 
     The frames are (T, H, W) or (T, C, H, W), full scale 1; the timing has the frame times of the file.
     """
-    stacks.check_stack_fits(given.info, restoration, on_gpu=given.torch_device.type != "cpu")
+    stacks.check_stack_fits(given.info, on_gpu=given.torch_device.type != "cpu")
     with working(f"reading {given.frames}"):
         frames = io.read_stack(given.frames, full_scale=given.scale)
     print_notes(given.info, given.settings)
@@ -80,31 +81,40 @@ def detect(given: DetectOptions) -> Answer:
 
 
 @options
-class RestoreOptions(shared.RestoredStack, shared.RestorationCommand):
-    """Options of ``restore``."""
+class MotionOptions(shared.StackCommand, shared.VerdictOptions):
+    """Options of ``motion``."""
 
-    vibration: Path = option(...)
-    """The vibration.json written by detect or run."""
+    out: Path = option(...)
+    """CSV file to write: time in s, x and y in px, and their standard deviations (model free)."""
+    model: Literal["free", "swept"] = "free"
+    """free: a smooth curve of any shape; swept: one sinusoid per axis whose amplitude decays or grows and whose
+    frequency changes linearly."""
+    detection: Annotated[Table, Given(FreeMotionOptions, ("knot_rows", "search"))]
 
 
-def restore_frames(given: RestoreOptions) -> Answer:
-    """Restore a stack of frames with a detected vibration.
+def motion(given: MotionOptions) -> Answer:
+    """Detect motion that is not a steady vibration.
 
-    The result is judged. If the restored frames are judged no better than the input, the input is written
-    unchanged, unless --force is given.
+    To restore frames with the CSV file: rsvib restore --motion FILE --unit px --offset 0.
     """
-    settings, frames, restored = given.settings, given.frames, given.restored
-    shared.check_new([*io.stack_files(restored), given.manifest], given.overwrite, [*given.inputs, given.vibration])
-    info, scale, options = given.planned_stack(given.restoration)
-    detected = reports.read_vibration(given.vibration, io.timing_from_first_frame(settings.timing, info))
-    stacks.check_stack_fits(info, options, on_gpu=given.torch_device.type != "cpu")
-    print_notes(info, settings)
-    of_run = given.of_stack(scale, options) | {"force": given.force, "given": [detected]}
-    with working(f"restoring {frames.name}"):
-        run = stacks.process_stack(frames, restored, settings.timing, window=max(2, info.shape[0]), **of_run)
-    lines, data = answers.restoration_of(run, restored)
+    out, frames = given.out, given.frames
+    shared.check_file(out, given.overwrite, given.inputs)
+    chosen = {name: value for name, value in given.detection.items() if given.model == "free" or name == "search"}
+    pixels, timing = load(given)
+    result: detection.MotionDetection | detection.SweptTone
+    with working("detecting the motion"):
+        if given.model == "free":
+            result = detection.detect_motion(pixels, timing, **chosen)
+        else:
+            result = detection.detect_swept_tone(pixels, timing, **chosen)
+    columns = reports.motion_columns(result, timing)
+    reports.write_columns(out, columns)
+    known_motion = ("--motion", out, "--unit", "px", "--offset", "0")
+    restore = ("restore", frames, frames.with_name("restored.tif"), *given.settings.arguments, *known_motion)
     return Answer(
-        {"Vibration": [detected.summary()], "Restoration": lines},
-        {"detection": detected.to_dict(), "restoration": data},
-        [restored, given.manifest],
+        {f"Motion in {frames.name}": [result.summary()]},
+        {"motion": answers.without_curves(result), "columns": list(columns)},
+        [out],
+        [answers.next_step("restore the frames", *restore)] * bool(result.reliable.any()),
+        answers.verdicts([result]),
     )

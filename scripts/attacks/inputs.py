@@ -74,7 +74,7 @@ def _attempts(place: Path) -> Iterator[tuple[str, Callable[..., None], tuple[obj
         source = place / stack
         for alias, output in _aliases(source).items():
             yield command(f"restore {stack}: {alias}", "restore", source, output, *config, *vibration)
-            yield command(f"known {stack}: {alias}", "known", source, output, *config, *known)
+            yield command(f"known {stack}: {alias}", "restore", source, output, *config, *known)
             yield f"process_stack {stack}: {alias}", _processed, (source, output, None)
             yield f"write_stack like {stack}: {alias}", _written, (str(source), str(output))
     folders = {"the input": place / "pngs", "a folder in it": place / "pngs" / "out", "the folder of it": place}
@@ -103,7 +103,7 @@ def _attempts(place: Path) -> Iterator[tuple[str, Callable[..., None], tuple[obj
     shutil.copy(place / "frames.zarr" / "zarr.json", place / "tree.zarr")
     shutil.copy(place / "frames.tif", place / "tree.zarr")
     inside = place / "tree.zarr" / "frames.tif"
-    yield command("known: folder around the input", "known", inside, place / "tree.zarr", *config, *known)
+    yield command("known: folder around the input", "restore", inside, place / "tree.zarr", *config, *known)
     yield "process_stack: folder around the input", _processed, (inside, place / "tree.zarr", None)
 
 

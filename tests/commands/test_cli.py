@@ -109,7 +109,7 @@ def test_known_motion_that_makes_frames_worse_leaves_them_unchanged_unless_force
     np.savetxt(tmp_path / "motion.csv", table, delimiter=",", header="time,x,y", comments="")
     text = "[sensor]\nrow_time = 4e-5\nexposure_rows = 12\nframe_rows = 210\nfull_scale = 4095\n"
     (tmp_path / "camera.toml").write_text(text)
-    known = ("known", tmp_path / "frames.tif", tmp_path / "k.tif", "--config", tmp_path / "camera.toml")
+    known = ("restore", tmp_path / "frames.tif", tmp_path / "k.tif", "--config", tmp_path / "camera.toml")
     known += ("--motion", tmp_path / "motion.csv", "--unit", "px", "--offset", "0")
     assert rsvib(*known) == 0
     shown = capsys.readouterr()

@@ -117,7 +117,7 @@ def test_clock_offsets_beyond_the_recording_are_reported(frames, tmp_path):
 def test_command_refuses_a_motion_that_enlarges_the_offsets_unless_forced(frames, gyroscope, tmp_path, capsys):
     (tmp_path / "camera.toml").write_text(CONFIG)
     rsv.write_stack(tmp_path / "frames.tif", frames)
-    known = ("known", tmp_path / "frames.tif", tmp_path / "out.tif", "--config", tmp_path / "camera.toml")
+    known = ("restore", tmp_path / "frames.tif", tmp_path / "out.tif", "--config", tmp_path / "camera.toml")
     arguments, focal = (*known, "--unit", "rad/s", "--motion"), ("--focal-length", 900)
     header, *lines = gyroscope.read_text().splitlines()
     signs = [f"{time},{-float(x)},{-float(y)}" for time, x, y in (line.split(",") for line in lines)]

@@ -143,7 +143,7 @@ def test_command_estimates_the_clock(frames, tmp_path, capsys):
     log = "GYROFLOW IMU LOG\nversion,1.3\nid,test\norientation,XYZ\ntscale,1e-6\ngscale,1e-6\nt,gx,gy,gz\n"
     scaled = 1e6 * torch.cat([rates.times[:, None], rates.rates], 1)
     (tmp_path / "clip.gcsv").write_text(log + "\n".join(",".join(f"{v:.0f}" for v in row) for row in scaled.tolist()))
-    known = ("known", tmp_path / "frames.tif", tmp_path / "out.tif", "--config", tmp_path / "camera.toml")
+    known = ("restore", tmp_path / "frames.tif", tmp_path / "out.tif", "--config", tmp_path / "camera.toml")
     arguments = (*known, "--motion", tmp_path / "clip.gcsv", "--device", "cpu", "--json")
     assert rsvib(*arguments) == 0
     found = json.loads(capsys.readouterr().out)["alignment"]
@@ -161,7 +161,7 @@ def test_rows_that_do_not_count(tmp_path, capsys):
     rsv.write_stack(tmp_path / "frames.tif", take(TIMING, dashboard=130))
     (tmp_path / "camera.toml").write_text("[sensor]\nrow_time = 8e-5\nexposure_rows = 10\nframe_rows = 420\n")
     write_rates(tmp_path / "rates.csv", recorded("ZXY"))
-    known = ("known", tmp_path / "frames.tif", tmp_path / "out.tif", "--config", tmp_path / "camera.toml")
+    known = ("restore", tmp_path / "frames.tif", tmp_path / "out.tif", "--config", tmp_path / "camera.toml")
     known += ("--motion", tmp_path / "rates.csv", "--device", "cpu", "--force", "--overwrite", "--json")
     found = []
     for more in ([], ["--ignore", "70:140,:", "--ignore", "140:"]):

@@ -69,7 +69,7 @@ def test_zarr_that_expands_is_refused_by_every_command(tmp_path, set_free, capsy
         ("run", stack, out),
         ("detect", stack, "--out", out),
         ("motion", stack, "--out", tmp_path / "motion-out.csv"),
-        ("known", stack, f"{out}.tif", "--motion", tmp_path / "motion.csv", "--unit", "px"),
+        ("restore", stack, f"{out}.tif", "--motion", tmp_path / "motion.csv", "--unit", "px"),
     ):
         error = refused(capsys, *arguments, *camera)
         assert re.search(r"memory.*(takes about|need) [0-9.]+ GB|need [0-9.]+ GB of memory", error), error
