@@ -10,8 +10,6 @@ from .plots import psf_figure as psf_figure
 from .plots import rows_figure as rows_figure
 from .plots import save_figure as save_figure
 from .plots import windows_figure as windows_figure
-from .results import check_same_timing as check_same_timing
-from .results import load_detection as load_detection
 from .results import motion_columns as motion_columns
 from .results import read_vibration as read_vibration
 from .results import restoration_data as restoration_data

@@ -63,24 +63,18 @@ def read_vibration(path: str | os.PathLike[str], timing: SensorTiming | None = N
         >>> rsv.read_vibration(path, timing).vibration.frequency[:, 0].round().tolist()  # Hz
         [110.0, 90.0]
     """
-    result = load_detection(Path(path))
-    if timing is not None and result.timing is not None:
-        check_same_timing(str(path), result.timing, timing)
-    return DetectedVibration.of(result)
-
-
-def load_detection(path: Path) -> DetectionResult:
-    """Read a ``vibration.json``; an error states what to give instead of other files."""
-    data = read_json(path, "vibration.json")
+    data = read_json(Path(path), "vibration.json")
     if data.get("format") != DetectionResult.file_format:
         raise ValueError(
             f"{path}: not a vibration.json, but a file of the format {quoted(data.get('format'))}; give the "
             "vibration.json that rsvib detect or run wrote (rsvib run restores windows)"
         )
-    result = result_of(DetectionResult, data, path)
+    result = result_of(DetectionResult, data, Path(path))
     if result.batch_shape:
         raise ValueError(f"{path}: a batch of detections; read it with DetectionResult.load, and pass one of them")
-    return result
+    if timing is not None and result.timing is not None:
+        check_same_timing(str(path), result.timing, timing)
+    return DetectedVibration.of(result)
 
 
 def check_same_timing(source: str, stored: SensorTiming, timing: SensorTiming) -> None:
