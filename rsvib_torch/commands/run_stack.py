@@ -163,20 +163,20 @@ def _process_windows(
     if result.bad_frames:
         warn(f"{number_of(result.bad_frames, 'frame')} could not be used: see manifest.json")
     answers.note_lost(restored, result.not_kept)
-    after, window, options = first.frames.cpu(), first.window, common["restoration"]
+    after, options = first.frames.cpu(), common["restoration"]
     # the page shows all frames of the window, the figure one of them: of a joint image, that in the middle
-    indices = first.indices or range(window.first, window.last + 1)
+    indices = first.indices or [index for index in first.window.written if index not in first.bad_frames]
     if not given.report:
         middle = 0 if first.indices else len(indices) // 2
         indices, after = indices[middle : middle + 1], after[:1]
-    before = read_frames(frames, indices, common["full_scale"])
-    if options.get("mosaic") is not None:
+    before = read_frames(frames, indices, common["full_scale"]) if len(after) else after
+    if len(before) and options.get("mosaic") is not None:
         before = preparation.colour_frames(before, options["mosaic"])
     found = first.detection if isinstance(first.detection, detection.DetectionResult) else None
     timing = io.timing_from_first_frame(settings.timing, info)
     if found is not None and found.timing is not None and result.windows > 1:
         timing = found.timing
-    shown = (before, after, indices[0], first.restored, timing, stacks.read_manifest(manifest))
+    shown = (before, after, first.window.first, first.restored, timing, stacks.read_manifest(manifest))
     return result, _Shown(*shown, detection=found, restoration=first.restoration, options=options)
 
 
@@ -250,7 +250,7 @@ def _comparison(shown: _Shown) -> Figure:
 
 def _write_page(folder: Path, given: RunOptions, shown: _Shown, answer: Answer) -> list[str]:
     """Write the page, and return the names of its files."""
-    if shown.detection is None and not shown.stored.is_followed:
+    if not len(shown.after) or (shown.detection is None and not shown.stored.is_followed):
         warn("report.html is not written: the vibration of the first window is not known")
         return []
     judged = shown.restoration
