@@ -176,7 +176,7 @@ def _process_windows(
     timing = io.timing_from_first_frame(settings.timing, info)
     if found is not None and found.timing is not None and result.windows > 1:
         timing = found.timing
-    shown = (before, after, first.window.first, first.restored, timing, stacks.read_manifest(manifest))
+    shown = (before, after, next(iter(indices), 0), first.restored, timing, stacks.read_manifest(manifest))
     return result, _Shown(*shown, detection=found, restoration=first.restoration, options=options)
 
 
@@ -192,7 +192,9 @@ def _process_video(
     with working(f"restoring {frames.name}", counts=True) as progress:
         result = video.process_video(frames, restored, settings.timing, **of_run, progress=progress)
     stored = stacks.read_manifest(manifest)
-    first = min(8, max(info.shape[0] // 2 - 1, 0))  # earlier ones must be decoded as well
+    bad = stored.bad_frames
+    pairs = (number for number in range(info.shape[0] - 1) if str(number) not in bad and str(number + 1) not in bad)
+    first = min(pairs, key=lambda number: abs(number - 8))  # earlier frames must be decoded as well
     before = read_frames(frames, (first, first + 1), stored.settings["full_scale"])
     if stored.margins is not None:
         before = video.Margins(**stored.margins).cut(before)
