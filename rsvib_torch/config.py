@@ -1,15 +1,13 @@
-"""TOML configuration files: the camera, and the options of simulation, detection and restoration.
+"""TOML configuration files: the camera, and the options of detection and restoration.
 
-A file is checked without torch, whose import takes seconds, except for ``[simulation]``.
+A file is checked without torch, whose import takes seconds.
 """
 
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 
-from rsvib_torch import imaging
 from rsvib_torch.checks.validation import options, validate
 from rsvib_torch.files.reading import Table, read_toml
 from rsvib_torch.motion.timing import SensorSection, SensorTiming
@@ -25,7 +23,6 @@ class Config:
     full_scale: float | None  # count that corresponds to 1.0 in integer frames; None if it is not in the file
     detection: Table  # options of ``detect_vibration`` that are in the file
     restoration: Table  # options of ``restore`` that are in the file
-    simulation: "imaging.SimulationSection | None"  # ``[simulation]``, if it is in the file
     stack: Table  # options ``window``, ``follow`` and ``bad_frames`` of ``process_stack`` that are in the file
     # options of the program that describe the camera, for the commands that it suggests
     arguments: tuple[str, ...] = ()
@@ -34,22 +31,12 @@ class Config:
 
 @options
 class ConfigFile:
-    """All tables of a file; those of ``[simulation]`` are checked by ``SimulationSection``, which needs torch."""
+    """All tables of a file."""
 
     sensor: SensorSection
     detection: ToneOptions | None = None
     restoration: RestorationOptions | None = None
-    simulation: Table | None = None
     stack: WindowOptions | None = None
-
-
-def presets() -> dict[str, str]:
-    """Text of the configuration files that are part of the package, by name."""
-    folder = files("rsvib_torch") / "presets"
-    return {
-        entry.name.removesuffix(".toml"): entry.read_text(encoding="utf-8")
-        for entry in sorted(folder.iterdir(), key=lambda entry: entry.name)
-    }
 
 
 def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, object] | None = None) -> Config:
@@ -61,8 +48,6 @@ def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, obj
       and ``frame_rows`` if they are known in seconds, and ``full_scale``.
     * ``[detection]``: options of ``detect_vibration``.
     * ``[restoration]``: options of ``restore``, with ``saturation`` in the unit of the frames' file.
-    * ``[simulation]``: ``num_frames``, ``frame_size``, ``seed``, ``[simulation.vibration]`` (fields of ``Vibration``)
-      and ``[simulation.noise]`` (fields of ``SensorNoise``).
     * ``[stack]``: ``window``, ``follow`` and ``bad_frames`` of ``process_stack``.
 
     Args:
@@ -88,16 +73,12 @@ def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, obj
             stated = {name: value for name, value in stated.items() if name not in replaced}
             data["sensor"] = {**stated, **sensor}
     content = validate(ConfigFile, data, source)
-    simulation = None
-    if content.simulation is not None:
-        simulation = validate(imaging.SimulationSection, content.simulation, source, "simulation")
     return Config(
         source=source,
         timing=content.sensor.to_timing(),
         full_scale=content.sensor.full_scale,
         detection=data.get("detection", {}),
         restoration=data.get("restoration", {}),
-        simulation=simulation,
         stack=data.get("stack", {}),
         path=None if path is None else Path(path),
     )

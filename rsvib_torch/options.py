@@ -24,7 +24,6 @@ from rsvib_torch.checks.validation import (
     fields_of,
     options,
 )
-from rsvib_torch.checks.values import refused
 
 if TYPE_CHECKING:
     from rsvib_torch.checks.arrays import ArrayLike
@@ -44,7 +43,6 @@ PixelFormat = Literal["gray8", "gray16le", "rgb24", "bgr24"]  # of raw frames in
 BadFrames = Literal["pass", "skip"]
 Channels = Literal["first", "last"] | None
 DetectionMethod = Literal["direct", "bands"]
-ExportFormat = Literal["gcsv", "csv"]
 Mosaic = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
 MotionUnit = Literal["px", "rad", "mrad", "urad", "deg", "arcsec", "rad/s", "deg/s"]
 PriorName = Literal["gaussian", "edges"]
@@ -254,7 +252,7 @@ class ExactOptions(JointOptions):
     """Colours of the pixels (0, 0), (0, 1), (1, 0), (1, 1) of raw frames (T, H, W) or (T, 1, H, W) behind colour
     filters: ``"RGGB"``, ``"BGGR"``, ``"GRBG"`` or ``"GBRG"``. The restored frames have three channels R, G, B, see
     ``restore_mosaic``."""
-    optics: OpticsOptions | None = Field(default=None, json_schema_extra=COMMAND_LINE)
+    optics: OpticsOptions | None = None
     """Optics of the camera, pixel included: the restored frames are as sharp as from a camera with pixels of the
     restored grid behind a Gaussian of half a pixel, ``Optics(sigma=0.5 / scale, pixel=1 / scale)``, where noise allows
     it, see ``sharpened``. None: the restored frames have the sharpness of the camera at rest."""
@@ -319,9 +317,8 @@ class RestorationOptions(ExactOptions, BandedOptions, DewarpOptions, RichardsonL
         for group in METHOD_OPTIONS.values():
             for name, field in fields_of(group).items():
                 if name not in names and getattr(self, name) != field.default:
-                    raise refused(
-                        ValueError, name, f"is no option of method={self.method!r}; its options are {', '.join(names)}"
-                    )
+                    of_method = f"method={self.method!r}; its options are {', '.join(names)}"
+                    raise ValueError(f"{name} is no option of {of_method}")
 
 
 @options

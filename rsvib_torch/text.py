@@ -16,23 +16,18 @@ AXES = ("x", "y", "roll", "zoom")  # components of a motion
 
 
 def printable(text: str, *, lines: bool = False) -> str:
-    r"""Text with escapes instead of control characters, direction marks and bytes that are not UTF-8.
+    r"""Text with escapes instead of control characters, direction marks and bytes that are not UTF-8 (``\udcff``).
 
     Names of files may contain them; a terminal would execute control characters.
 
     Example:
         >>> printable("a\x1b[31m\n\u202eb\udcff")
-        'a\\x1b[31m\\n\\u202eb\\xff'
+        'a\\x1b[31m\\n\\u202eb\\udcff'
     """
-
-    def shown(character: str) -> str:
-        if character.isprintable() or (lines and character == "\n"):
-            return character
-        if 0xDC80 <= ord(character) <= 0xDCFF:  # byte that is not UTF-8, as ``os.fsdecode`` represents it
-            return f"\\x{ord(character) - 0xDC00:02x}"
-        return character.encode("unicode_escape", "surrogatepass").decode()
-
-    return text if text.isprintable() else "".join(map(shown, text))
+    return "".join(
+        character if character.isprintable() or (lines and character == "\n") else ascii(character)[1:-1]
+        for character in text
+    )
 
 
 def measured_text(

@@ -16,7 +16,6 @@ import harness
 import typer
 from architecture import table_of_packages
 
-import rsvib_torch as rsv
 from rsvib_torch.checks.validation import fields_of
 from rsvib_torch.checks.values import members_of
 from rsvib_torch.commands.main import app
@@ -30,11 +29,10 @@ CONFIGURATION = f"""{NOTE}
 
 # Configuration
 
-A TOML file describes a camera and the processing of its frames. `rsvib init FRAMES` writes one, and
-`rsvib init --preset NAME` copies a complete example. Only `[sensor]` is required. The options `--row-time`,
-`--exposure`, `--frame-rate`, `--scan-axis` and `--readout-direction` of the [commands](commands.md) replace keys of
-`[sensor]`, or the file. Unknown keys and wrong values are errors, one line each, with the path of the key, its value
-and the expected value.
+A TOML file describes a camera and the processing of its frames. `rsvib init FRAMES` writes one. Only `[sensor]` is
+required. The options `--row-time`, `--exposure`, `--frame-rate`, `--scan-axis` and `--readout-direction` of the
+[commands](commands.md) replace keys of `[sensor]`, or the file. Unknown keys and wrong values are errors, one line
+each, with the path of the key, its value and the expected value.
 """
 SENSOR = """The camera. Exposure and frame period are in seconds (`exposure_time`, `frame_rate`) or in row times
 (`exposure_rows`, `frame_rows`); both keys of a pair may be given if they agree within 0.1 %.
@@ -110,9 +108,6 @@ def key_table(group: Any, keys: Iterable[str] = (), meaning: Mapping[str, str] |
 
 def configuration_page() -> str:
     """Markdown of the reference of the configuration file."""
-    simulation = rsv.imaging.SimulationSection
-    plain = [key for key in fields_of(simulation) if key not in ("vibration", "noise")]
-    vibration = fields_of(simulation)["vibration"].annotation
     lines = [CONFIGURATION, "## [sensor]", "", SENSOR, ""]
     lines += key_table(SensorSection)
     lines += ["## [detection]", "", "Options of `detect_vibration`.", "", *key_table(ToneOptions)]
@@ -122,12 +117,6 @@ def configuration_page() -> str:
         lines += [f'Options of `method = "{name}"`:', "", *key_table(group)]
     lines += ["## [restoration.optics]", "", "Optics of the camera, see `optics`.", "", *key_table(OpticsOptions)]
     lines += ["## [stack]", "", "Processing of stacks in windows.", "", *key_table(WindowOptions)]
-    lines += ["## [simulation]", "", "For `rsvib simulate`.", ""]
-    lines += key_table(simulation, plain)
-    lines += ["## [simulation.vibration]", "", "The motion that is simulated; required for a simulation.", ""]
-    lines += key_table(vibration, meaning=documented(rsv.Vibration))
-    lines += ["## [simulation.noise]", "", "Noise of the sensor; none without this table.", ""]
-    lines += key_table(rsv.SensorNoise)
     return "\n".join(lines)
 
 

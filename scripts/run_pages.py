@@ -23,7 +23,6 @@ from unittest import mock
 import nbclient
 import nbformat
 
-from rsvib_torch.commands import terminal
 from rsvib_torch.commands.main import run_command
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -50,7 +49,6 @@ def run_page(page: Path, folder: Path) -> tuple[str, dict[str, Any]]:
     names: dict[str, Any] = {"__name__": "page"}
     text = page.read_text(encoding="utf-8")
     parts, end, output = [], 0, None
-    terminal.LOG_AFTER = 3600.0  # s; pages show no progress
     with mock.patch.dict(os.environ, COLUMNS="100"):
         for block in BLOCK.finditer(text):
             between, (language, code) = text[end : block.start()], block.groups()

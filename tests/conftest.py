@@ -11,7 +11,6 @@ from PIL import Image
 from small_stack import FRAMES, WINDOWS, process_small, write_small
 
 from rsvib_torch import SensorTiming
-from rsvib_torch.commands import terminal
 
 settings.register_profile("any machine", deadline=None)  # the first example imports what it uses
 settings.load_profile("any machine")
@@ -73,12 +72,6 @@ def figures_are_not_rendered(request, monkeypatch):
 
     if not RENDERED & set(request.path.parts):
         monkeypatch.setattr(FigureCanvasBase, "print_figure", print_figure)
-
-
-@pytest.fixture(autouse=True)
-def write_no_progress(monkeypatch):
-    """Commands in the process of the tests write no lines of progress, however slow the machine is."""
-    monkeypatch.setattr(terminal, "LOG_AFTER", 3600.0)
 
 
 @pytest.fixture(name="set_free")

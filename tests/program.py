@@ -1,7 +1,5 @@
 """The program ``rsvib`` within the process of the tests."""
 
-import io
-
 from rsvib_torch.commands.main import run_command
 
 
@@ -18,10 +16,3 @@ def refused(capsys, *arguments):
     assert (shown.out, shown.err.count("\n")) == ("", 1)
     assert shown.err.startswith("rsvib: error: ")
     return shown.err
-
-
-class Terminal(io.StringIO):
-    """Standard input or error that is a terminal."""
-
-    def isatty(self):
-        return True

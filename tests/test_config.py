@@ -38,17 +38,15 @@ def test_the_timing_of_a_file_has_the_errors_of_its_sensor(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["iso12233", "in_orbit", "push_scan"])
-def test_shipped_configs_have_the_camera_of_the_paper_and_a_visible_vibration(name):
+def test_shipped_configs_have_the_camera_of_the_paper(name):
     config = read_config(CONFIGS / f"{name}.toml")
     assert config.timing == SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
-    vibration = config.simulation.vibration.to_vibration()
-    assert vibration.gain(config.timing.frame_period).abs().min() > 0.5
 
 
 def test_only_the_sensor_is_required_and_missing_options_are_not_filled_in(tmp_path):
     config = read(tmp_path, SENSOR)
     assert config.timing == SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
-    assert (config.full_scale, config.detection, config.restoration, config.simulation) == (None, {}, {}, None)
+    assert (config.full_scale, config.detection, config.restoration) == (None, {}, {})
     config = read(tmp_path, SENSOR + 'scan_axis = "x"\nreadout_direction = "reverse"\nframe_start_times = [0.0, 0.5]\n')
     assert (config.timing.scan_axis, config.timing.readout_direction) == (-1, "reverse")
     assert config.timing.frame_start_times == (0.0, 0.5)
@@ -79,9 +77,6 @@ def test_keys_that_replace_those_of_the_file(tmp_path):
         read_config(None, sensor={"row_time": 2e-5, "frame_rate": 30.0})
 
 
-VIBRATION = "[simulation.vibration]\namplitude = [1, 2]\nfrequency = [40, 30]\n"
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -100,17 +95,6 @@ VIBRATION = "[simulation.vibration]\namplitude = [1, 2]\nfrequency = [40, 30]\n"
         (SENSOR + "[detection]\ntones = 'few'", "detection.tones must be"),
         (SENSOR + "[restoration]\nmethod = 'magic'", "restoration.method must be '"),
         (SENSOR + "[restoration]\nmethod = 'banded'\nhalf_row = 1", "unknown option 'restoration.half_row'; "),
-        (SENSOR + "[simulation]\nseed = 1", "simulation.vibration is missing; expected a table with amplitude, freq"),
-        (SENSOR + VIBRATION.replace("[1, 2]", "[-1, 2]"), "simulation.vibration: amplitude must not be negative, got"),
-        (
-            SENSOR + VIBRATION + "camera = {focal_length = 0}",
-            "simulation.vibration.camera.focal_length must be at least 1",
-        ),
-        (
-            SENSOR + VIBRATION + "camera = {focal_length = 9, distortion = [1, 2, 3, 4]}",
-            "simulation.vibration.camera: distortion must be 5 numbers",
-        ),
-        (SENSOR + VIBRATION + "[simulation.noise]\nfull_well = 0", "simulation.noise.full_well must be larger than"),
         (SENSOR + "[stack]\nwindow = 1", "stack.window must be at least 2, got 1"),
         ("[sensor", "not a TOML file: Expected ']'"),
     ],

@@ -2,12 +2,9 @@
 
 import re
 import runpy
-import sys
 import tomllib
 from fnmatch import fnmatch
 from pathlib import Path
-
-import pytest
 
 import rsvib_torch as rsv
 
@@ -33,7 +30,7 @@ def test_files_that_are_not_modules_are_package_data():
     package = Path(rsv.__file__).parent
     others = [path.relative_to(package) for path in package.rglob("*") if path.is_file()]
     others = [path for path in others if path.suffix not in (".py", ".pyc")]
-    assert {"py.typed", "__init__.pyi", "iso12233.toml", "report.html"} <= {path.name for path in others}
+    assert {"py.typed", "__init__.pyi", "readout_times.csv", "report.html"} <= {path.name for path in others}
     for path in others:
         assert any(fnmatch(str(path), pattern.replace("**/", "*")) for pattern in patterns), path
 
@@ -63,8 +60,3 @@ def test_every_dependency_has_a_lower_bound_below_the_tested_version():
         name, bound = re.fullmatch(r"([\w-]+)(?:\[\w+\])?>=([\d.]+)", line).groups()
         lowest, tested = ([int(part) for part in re.findall(r"\d+", text)] for text in (bound, pins[name.lower()]))
         assert lowest <= tested, line
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="a link")
-def test_configs_are_the_presets():
-    assert (ROOT / "configs").resolve() == (ROOT / "rsvib_torch" / "presets").resolve()

@@ -45,11 +45,9 @@ def loaded(code, names, folder):
 COMMANDS = (  # help, lists, and what is refused before anything is computed
     "--help",
     "known --help",
-    "export vibration.json clip.unknown",
     "run frames.tif out --config none.toml",
     "detect frames.tif --out out --config bad.toml",
     "detect frames.tif --out out --config camera.toml --exposure 1",
-    "init --list-presets",
     "cameras iphone 12",
 )
 

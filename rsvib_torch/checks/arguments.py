@@ -33,18 +33,11 @@ def check_tensor(name: str, value: object) -> Tensor:
     """Return ``value`` if it is a dense tensor of real numbers that has data."""
     if not isinstance(value, Tensor):
         raise TypeError(f"{name} must be a tensor, got {described(value)}")
-    if value.is_nested:
-        raise TypeError(f"{name} must be a dense tensor, got a nested tensor; pass its parts one by one")
-    if value.layout != torch.strided:
-        raise TypeError(f"{name} must be a dense tensor, got {value.layout}; call {name}.to_dense()")
-    if value.is_quantized:
-        raise TypeError(f"{name} must not be quantised, got {value.dtype}; call {name}.dequantize()")
-    if value.is_complex():
-        raise TypeError(f"{name} must be real numbers, got {value.dtype}")
-    if value.is_floating_point() and value.dtype.itemsize == 1:
-        raise TypeError(f"{name} must have at least 16 bits, got {value.dtype}; call {name}.float()")
-    if value.device.type == "meta":
-        raise TypeError(f"{name} must be a tensor with data, got a meta tensor; load the data onto a device first")
+    if value.layout != torch.strided or value.is_nested or value.is_quantized or value.is_meta:
+        kind = "a nested tensor" if value.is_nested else f"{value.layout}, {value.dtype} on {value.device}"
+        raise TypeError(f"{name} must be a dense tensor that has data, got {kind}")
+    if value.is_complex() or (value.is_floating_point() and value.dtype.itemsize == 1):
+        raise TypeError(f"{name} must be real numbers of at least 16 bits, got {value.dtype}")
     return value
 
 

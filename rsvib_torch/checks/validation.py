@@ -147,9 +147,7 @@ def validate(group: type[_Result], data: Mapping[str, object], source: str, path
         mistakes = mistakes_of(error, data, path, group)
         lines = [f"{source}: {one_line(mistake)}" for mistake in mistakes]
         more = [f"{source}: {len(lines) - _MAX_LINES} more mistakes"] if len(lines) > _MAX_LINES else []
-        all_lines = MistakesError([*lines[:_MAX_LINES], *more])
-        vars(all_lines).update(vars(mistakes[0]))  # its argument
-        raise all_lines from error
+        raise MistakesError([*lines[:_MAX_LINES], *more]) from error
 
 
 def read_json(path: Path, what: str) -> Table:

@@ -16,7 +16,6 @@ from pydantic_core import ErrorDetails
 
 from rsvib_torch.text import quoted
 
-Error = TypeVar("Error", bound=Exception)
 Value = TypeVar("Value")
 
 # Largest magnitude of numbers and pixels of public functions: squares of float32 are finite up to 1.8e19, and sums of
@@ -44,13 +43,6 @@ def described(value: object) -> str:
     if isinstance(value, (list, tuple)) and len(value) < 10 and all(isinstance(item, (int, float)) for item in value):
         return repr(value)
     return type(value).__name__
-
-
-def refused(kind: type[Error], name: str, problem: str) -> Error:
-    """The error of an argument: its name, also as data for the option of a command, and what is wrong with it."""
-    error = kind(f"{name} {problem}")
-    vars(error).update(argument=name)
-    return error
 
 
 def check_single(name: str, batch_shape: Sequence[int]) -> None:
@@ -133,16 +125,13 @@ def _explained(path: str, keys: Sequence[str | int], entries: list[ErrorDetails]
         return TypeError(f"{place} is missing{table and f'; expected a table with {table}'}")
     if kind == "unexpected_keyword_argument":
         return TypeError(f"unknown option {quoted(place)}; the options are {', '.join(_options_at(group, keys[:-1]))}")
-    if kind == "value_error":  # of a validator, which may state its argument
-        cause = context["error"]
-        if argument := getattr(cause, "argument", ""):
-            return refused(ValueError, f"{place}.{argument}".strip("."), str(cause).removeprefix(argument).strip())
-        return ValueError(f"{place}: {cause}" if place else str(cause))
+    if kind == "value_error":  # of a validator
+        return ValueError(f"{place}: {context['error']}" if place else str(context["error"]))
     texts = (_BOUNDS[kind].format(**context),) if kind in _BOUNDS else (one["msg"] for one in entries)
     expected = " or ".join(dict.fromkeys(text.removeprefix("Input should be ") for text in texts))
     expected = expected.replace("a valid integer", "a whole number").replace("a valid ", "a ")
     of_value = kind in _BOUNDS or all(one["type"] == "literal_error" for one in entries)
-    return refused(ValueError if of_value else TypeError, place, f"must be {expected}, got {described(entry['input'])}")
+    return (ValueError if of_value else TypeError)(f"{place} must be {expected}, got {described(entry['input'])}")
 
 
 def _options_at(group: object, keys: Sequence[str | int]) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,18 +17,19 @@ from rsvib_torch.files.reading import Table
 from rsvib_torch.text import AXES, number_of, printable, wrapped
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from rsvib_torch.config import Config
     from rsvib_torch.motion.detected_vibration import DetectedVibration
     from rsvib_torch.motion.timing import SensorTiming
+    from rsvib_torch.results.presentation import Result
 
 
-def _shell_word(text: str) -> str:
-    r"""A word of a command line; ``$'...'`` where it contains characters that are not printed as they are."""
-    if printable(text) == text:
-        return shlex.quote(text)
-    return "$'" + printable(text.replace("\\", "\\\\").replace("'", "\\'")) + "'"
+_CURVES = {"motion", "times", "displacement", "offsets", "residual", "light", "fitted_light", "measured", "predicted"}
+
+
+def without_curves(result: Result) -> Table:
+    """The values of a result without its curves, which have a value for every row or knot."""
+    curves = _CURVES | ({"std"} if isinstance(result, detection.MotionDetection) else set())
+    return {name: value for name, value in result.to_dict().items() if name not in curves}
 
 
 def detection_data(result: detection.DetectionResult) -> Table:
@@ -76,14 +77,13 @@ def windows_answer(
     return answer
 
 
-def warn_of_restoration(result: stacks.RestoredFrames, output: str = "frames") -> None:
+def warn_of_restoration(result: stacks.RestoredFrames) -> None:
     """Print a warning if there is nothing to restore, or if restoration does not help or may not."""
-    kept = "the frames are written unchanged" if output == "frames" else "the page has the input frames only"
-    forced = "writes" if output == "frames" else "shows"
+    kept = "the frames are written unchanged"
     if not result.moves:
         warn(f"no vibration was found that can be removed: {kept}")
     elif result.verdict is not None and result.verdict.overall in ("partly", "worse"):
-        unchanged = "" if result.restored else f"; {kept}, --force {forced} the restored ones"
+        unchanged = "" if result.restored else f"; {kept}, --force writes the restored ones"
         warn(result.verdict.sentence + unchanged)
 
 
@@ -122,7 +122,7 @@ def restoration_of(run: stacks.StackReport, restored: Path) -> tuple[list[str], 
 
 def next_step(sentence: str, *command: object) -> str:
     """A step: a sentence, and the command that does it, which can be copied into a shell."""
-    return f"{sentence}:\n  {' '.join(['rsvib', *map(_shell_word, map(str, command))])}"
+    return f"{sentence}:\n  {printable(shlex.join(['rsvib', *map(str, command)]))}"
 
 
 def run_step(frames: Path, out: Path, arguments: Sequence[str]) -> str:
@@ -132,26 +132,20 @@ def run_step(frames: Path, out: Path, arguments: Sequence[str]) -> str:
 
 
 def steps_after_detection(
-    result: detection.DetectionResult | None, frames: Path, settings: Config, vibration: Path | None = None
+    result: detection.DetectionResult, frames: Path, settings: Config, vibration: Path | None = None
 ) -> list[str]:
-    """What to do after a detection (None for windows): restore with the file ``vibration``, or try another model."""
+    """What to do after a detection: restore with the file ``vibration``, or try another model."""
     steps = []
-    if vibration is not None and (result is None or bool(result.reliable.any())):
+    if vibration is not None and bool(result.reliable.any()):
         restore = ("restore", frames, frames.with_name("restored.tif"), *settings.arguments, "--vibration", vibration)
         steps.append(next_step("restore the frames", *restore))
-    reasons = [] if result is None else [reason for of_axis in result.findings for reason in of_axis]
+    reasons = [reason for of_axis in result.findings for reason in of_axis]
     if any(reason.kind.free_model for reason in reasons):
         motion = ("motion", frames, *settings.arguments, "--out", "motion.csv")
         steps.append(next_step("detect a motion that is not a steady vibration", *motion))
     if reasons:
         steps.append("follow the remedies that the reasons above name")
     return steps
-
-
-def page_step(frames: Path, out: Path, settings: Config, *more: str | Path) -> str:
-    """The step to write a page about a restored stack."""
-    sentence = "write a page with all figures"
-    return next_step(sentence, "report", frames, out, *settings.arguments, *more)
 
 
 # Files in a folder
@@ -175,16 +169,6 @@ def remove_old(folder: Path, results: Iterable[str], names: Iterable[str]) -> No
         (folder / name).unlink(missing_ok=True)
 
 
-def draw_safely(path: Path, draw: Callable[[], Figure]) -> list[str]:
-    """Draw a figure and return its name; a warning if that fails, because the results do not depend on figures."""
-    try:
-        reports.save_figure(draw(), path)
-    except Exception as error:
-        warn(f"{path.name} is not drawn: {' '.join(str(error).split()) or type(error).__name__}")
-        return []
-    return [path.name]
-
-
 def write_detection(
     folder: Path, result: detection.DetectionResult, timing: SensorTiming, pixel_size: float | None = None
 ) -> list[str]:
@@ -193,12 +177,12 @@ def write_detection(
         replace(result, timing=timing).save(folder / "vibration.json")
         reports.write_table(folder / "tones.csv", result, pixel_size=pixel_size)
         reports.write_offsets(folder / "offsets.csv", result)
-        drawn = draw_safely(folder / "offsets.png", lambda: reports.offset_figure(result))
+        reports.save_figure(reports.offset_figure(result), folder / "offsets.png")
     with working("computing the spectrum"):
         spectrum = result.spectrum()
         reports.write_table(folder / "spectrum.csv", spectrum, pixel_size=pixel_size)
-        drawn += draw_safely(folder / "spectrum.png", spectrum.plot)
-    return [*drawn, "vibration.json", "tones.csv", "offsets.csv", "spectrum.csv"]
+        reports.save_figure(spectrum.plot(), folder / "spectrum.png")
+    return ["offsets.png", "spectrum.png", "vibration.json", "tones.csv", "offsets.csv", "spectrum.csv"]
 
 
 def write_windows(folder: Path, manifest: stacks.StackManifest, pixel_size: float | None = None) -> list[str]:
@@ -207,9 +191,10 @@ def write_windows(folder: Path, manifest: stacks.StackManifest, pixel_size: floa
     with working("drawing the windows"):
         write_json(folder / "windows.json", {"format": "rsvib windows", "version": 1, **manifest.totals()})
         reports.write_table(folder / "tones.csv", manifest, pixel_size=pixel_size)
-        # otherwise, no tones are searched for
-        drawn = draw_safely(folder / "windows.png", manifest.plot) if manifest.gyroscope is None else []
-    return [*drawn, "windows.json", "tones.csv"]
+        if manifest.gyroscope is not None:  # no tones are searched for
+            return ["windows.json", "tones.csv"]
+        reports.save_figure(manifest.plot(), folder / "windows.png")
+    return ["windows.png", "windows.json", "tones.csv"]
 
 
 def note_lost(path: Path, names: Sequence[str]) -> None:

@@ -2,8 +2,7 @@
 
 import inspect
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
@@ -102,23 +101,6 @@ def _parameters(group: type) -> Iterator[tuple[str, inspect.Parameter]]:
             yield name, _parameter(name, stated.annotation, default, forms[name])
 
 
-@contextmanager
-def _naming_options(parameters: Sequence[inspect.Parameter]) -> Iterator[None]:
-    """Errors name the arguments of Python functions and the keys of files: name the option that was given instead."""
-    try:
-        yield
-    except (TypeError, ValueError) as error:
-        # options replace the keys of [sensor], in a file as well
-        argument = getattr(error, "argument", "")
-        name = re.split(r"[.[]", argument.removeprefix("sensor."))[0]
-        for parameter in parameters:
-            info = get_args(parameter.annotation)[1]
-            if parameter.name == name and isinstance(info, typer.models.OptionInfo):
-                option = info.default if isinstance(info.default, str) else f"--{name.replace('_', '-')}"
-                raise ValueError(option + str(error).splitlines()[0].partition(argument)[2]) from error
-        raise
-
-
 def flat_command(name: str, command: Callable[[Group], Answer]) -> Callable[..., None]:
     """A command as typer calls it: its options are flat, and its answer is printed."""
     (group,) = (parameter.annotation for parameter in inspect.signature(command, eval_str=True).parameters.values())
@@ -135,8 +117,7 @@ def flat_command(name: str, command: Callable[[Group], Answer]) -> Callable[...,
                 values.setdefault(place, {}).update({parameter.name: value} if is_given else {})
         output = current_output()
         output.as_json, output.quiet = bool(given["as_json"]), bool(given["quiet"])
-        with _naming_options([parameter for _, parameter in fields if given[parameter.name] is not None]):
-            answer = command(group(**values))
+        answer = command(group(**values))
         show_answer(name, answer)
         required = values.get("require_reliable") or ""
         missed = [axis for axis in required.split(",") if required and not answer.reliable.get(axis)]

@@ -1,24 +1,18 @@
 """Commands ``init``, a configuration file for the camera of a stack, and ``cameras``, the known camera models."""
 
-import itertools
 import math
-import sys
 import textwrap
-from collections.abc import Mapping
-from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from rsvib_torch import gyroscope, io
 from rsvib_torch.checks.validation import MistakesError, fields_of, options
 from rsvib_torch.commands.answers import run_step
-from rsvib_torch.commands.flat_command import Given, argument, option
-from rsvib_torch.commands.shared_options import SENSOR_FORMS, check_file, rate, seconds, stated_exposure
+from rsvib_torch.commands.flat_command import Given, argument
+from rsvib_torch.commands.shared_options import SENSOR_FORMS, check_file, stated_exposure
 from rsvib_torch.commands.terminal import Answer, note, warn, working
-from rsvib_torch.config import presets, read_config
+from rsvib_torch.config import read_config
 from rsvib_torch.files.atomic import whole_file
 from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.cameras import camera_mode, find_cameras
@@ -28,7 +22,7 @@ from rsvib_torch.text import measured_text, printable, text_table
 if TYPE_CHECKING:
     from rsvib_torch.io.stack_info import StackInfo
 
-# How to find each value of [sensor]: comments of the file, and the text of questions and errors.
+# How to find each value of [sensor]: comments of the file, and the text of errors.
 _HINTS: dict[str, str] = {name: field.description for name, field in fields_of(SensorSection).items()}
 
 
@@ -36,7 +30,7 @@ _HINTS: dict[str, str] = {name: field.description for name, field in fields_of(S
 class InitOptions:
     """Options of ``init``."""
 
-    frames: Path | None = argument(default=None)
+    frames: Path = argument()
     """Stack of frames of the camera; its size, frame rate and times are read."""
     out: Path = Path("camera.toml")
     """Configuration file to write."""
@@ -45,9 +39,6 @@ class InitOptions:
     ]
     camera: str | None = None
     """Model of the camera, for its measured row time (rsvib cameras lists them)."""
-    preset: str | None = option(None, text=f"Copy a preset instead: {', '.join(presets())}.")
-    list_presets: bool = False
-    """List the presets and exit."""
     overwrite: bool = False
     """Replace an existing configuration file."""
 
@@ -55,28 +46,16 @@ class InitOptions:
 def init(given: InitOptions) -> Answer:
     """Write a configuration file for the camera of a stack of frames.
 
-    What the file does not state is taken from the options, or asked in a terminal with an explanation where to find it.
+    What the file does not state is taken from the options; an error explains where to find what is missing.
     """
-    frames, out, sensor, camera, preset = given.frames, given.out, given.sensor, given.camera, given.preset
-    if given.list_presets:
-        listed = {}
-        for name, text in presets().items():  # with the comment at the top in one line
-            comment = itertools.takewhile(lambda line: line.startswith("#"), text.splitlines())
-            listed[name] = " ".join(line.removeprefix("#").strip() for line in comment)
-        return Answer({"Presets": [f"{name}: {text}" for name, text in listed.items()]}, {"presets": listed})
-    if preset is not None and (frames is not None or sensor or camera is not None):
-        raise ValueError("--preset is a complete configuration: give no frames and no values of the sensor with it")
-    if camera is not None and "row_time" in sensor:
+    frames, out = given.frames, given.out
+    if given.camera is not None and "row_time" in given.sensor:
         raise ValueError("--camera and --row-time both state the row time; give one of them")
-    if preset is None and frames is None:
-        raise ValueError("give a stack of frames, or --preset NAME (--list-presets lists them)")
-    check_file(out, given.overwrite, [] if frames is None else io.stack_files(frames))
-    if preset is not None and preset not in presets():
-        raise ValueError(f"--preset must be one of {', '.join(presets())}; got {preset!r}")
-    text = presets()[preset] if preset is not None else _describe_camera(Path(frames or ""), sensor, camera)
+    check_file(out, given.overwrite, io.stack_files(frames))
+    text = _describe_camera(frames, given.sensor, given.camera)
     with whole_file(out) as file:
         file.write_text(text, encoding="utf-8")
-    return Answer({}, {}, [out], [run_step(frames or Path("FRAMES"), Path("results"), ["--config", str(out)])])
+    return Answer({}, {}, [out], [run_step(frames, Path("results"), ["--config", str(out)])])
 
 
 @options
@@ -117,9 +96,9 @@ def _row_time_of(camera: str, info: "StackInfo", values: Table) -> tuple[dict[st
 
 
 def _describe_camera(path: Path, given: Table, camera: str | None) -> str:
-    """Text of the configuration file: values of the command line, of the file, and of the answers to questions."""
-    with working(f"reading {path}"), closing(io.open_stack(path)) as reader:
-        info, first = reader.info, reader.frame(0)
+    """Text of the configuration file: values of the command line and of the file of the frames."""
+    with working(f"reading {path}"):
+        info = io.read_stack_info(path)
     size = f"{info.shape[0]} frames of {info.shape[-2]} x {info.shape[-1]} px (height x width), {info.dtype}"
     note(f"{path}: {size}")
     values, rows = dict(given), info.shape[-1 if given.get("scan_axis") == "x" else -2]
@@ -130,24 +109,17 @@ def _describe_camera(path: Path, given: Table, camera: str | None) -> str:
     elif stated is not None and not math.isclose(stated, given["frame_rate"], rel_tol=0.01):
         warn(f"--frame-rate is {given['frame_rate']:g}, the times in the file give {stated:.6g}")
     source, proposal = None, ""
-    likely: dict[str, float] = {}
     if camera is not None:
         known, source = _row_time_of(camera, info, values)
         values |= known
         note(source)
     elif info.camera is not None and "row_time" not in given:
         try:
-            likely, proposed = _row_time_of(info.camera, info, values)
+            _, proposed = _row_time_of(info.camera, info, values)
             proposal = f' The file names its camera: --camera "{info.camera}" takes {proposed}.'
         except ValueError as error:
             proposal = f" The file names its camera, {info.camera}: {error}."
-    if info.is_integer and info.full_scale is None:
-        # the largest count of the bit depth that the frame uses; multiples of 16 are 12 bits shifted by 4
-        import numpy as np  # noqa: PLC0415
-
-        step = max(int(np.gcd.reduce(first.ravel())), 1)
-        likely["full_scale"] = float(((1 << max(int(first.max()) // step, 255).bit_length()) - 1) * step)
-    elif info.dtype != "uint8" and info.full_scale is not None:
+    if info.dtype != "uint8" and info.full_scale is not None:
         values.setdefault("full_scale", info.full_scale)
     track = gyroscope.read_camera_track(path)
     if track is not None and "exposure_time" not in values and (exposure := stated_exposure(path)) is not None:
@@ -157,9 +129,7 @@ def _describe_camera(path: Path, given: Table, camera: str | None) -> str:
             f"the camera has stabilised the frames (IORI in the track of the video): it turned them by up to "
             f"{math.degrees(track.turned):.2g} degrees, and their rows no longer show its motion"
         )
-    _complete(values, rows, likely, proposal)
-    if "row_time" in likely and math.isclose(values["row_time"], likely["row_time"], rel_tol=1e-5):  # it was accepted
-        values["row_time_std"] = likely["row_time_std"]
+    _check_complete(values, info, rows, proposal)
     _check_timing(read_config(None, sensor=values).timing, rows)
     head = [
         f"Camera of {printable(path.name)}: {size}. Written by rsvib init.",
@@ -174,34 +144,18 @@ def _describe_camera(path: Path, given: Table, camera: str | None) -> str:
     return sensor_toml({name: values[name] for name in order if name in values}, head)
 
 
-def _complete(values: Table, rows: int, likely: Mapping[str, float], proposal: str) -> None:
-    """Ask for the values that are missing in a terminal, otherwise name all of them in an error."""
-    known = {"frame_rate": "--frame-rate", "row_time": "--row-time", "exposure_time": "--exposure"}
-    known |= {"full_scale": "--full-scale"} if "full_scale" in likely else {}
-    missing = {name: stated for name, stated in known.items() if name not in values}
-
-    def hint(name: str) -> str:  # how to find a value, with the limits that follow from the frames
+def _check_complete(values: Table, info: "StackInfo", rows: int, proposal: str) -> None:
+    """Raise an error that names the values that are missing, with what states each of them."""
+    needed = {"frame_rate": "--frame-rate", "row_time": "--row-time", "exposure_time": "--exposure"}
+    needed |= {"full_scale": "--full-scale"} if info.is_integer and info.full_scale is None else {}
+    mistakes = []
+    for name in (name for name in needed if name not in values):
+        hint = f"{needed[name]} is missing. {_HINTS[name]}"
         if name == "row_time" and values.get("frame_rate"):
-            longest = 1e6 / (values["frame_rate"] * rows)
-            return f"{_HINTS[name]} Here it is less than {longest:.4g} us.{proposal}"
-        return f"{_HINTS[name]} Frame 0 indicates {likely[name]:g}." if name in likely else _HINTS[name]
-
-    if missing and not (sys.stdin.isatty() and sys.stderr.isatty()):
-        raise MistakesError(f"{stated} is missing. {hint(name)}" for name, stated in missing.items())
-    for name, stated in missing.items():
-        typer.echo(f"\n{hint(name)}", err=True)
-        limits = {"row_time": 1.0 / rows, "exposure_time": 1.0}  # frame periods
-        longest = limits[name] / values["frame_rate"] if name in limits else math.inf
-
-        def checked_answer(text: str, is_time: bool = name in limits, longest: float = longest) -> float:
-            value = seconds(text) if is_time else rate(text)
-            if not 0 < value <= longest:
-                limit = "" if math.isinf(longest) else f" and at most {longest:.4g} s; units such as us can be added"
-                raise typer.BadParameter(f"expected a number above 0{limit}; got {text!r}")
-            return value
-
-        question, default = stated.strip("-").replace("-", " "), f"{likely[name]:.6g}" if name in likely else None
-        values[name] = typer.prompt(question, default=default, value_proc=checked_answer, err=True)
+            hint += f" Here it is less than {1e6 / (values['frame_rate'] * rows):.4g} us.{proposal}"
+        mistakes.append(hint)
+    if mistakes:
+        raise MistakesError(mistakes)
 
 
 def _check_timing(timing: SensorTiming, rows: int) -> None:

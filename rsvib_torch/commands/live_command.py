@@ -7,30 +7,27 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, BinaryIO
+from typing import TYPE_CHECKING, Annotated, BinaryIO, Literal
 
 from pydantic import Field
 
 from rsvib_torch import io, tracking, video
-from rsvib_torch.checks.validation import Count, NotNegative, options
+from rsvib_torch.checks.validation import NotNegative, options
 from rsvib_torch.commands.answers import detection_data
 from rsvib_torch.commands.flat_command import Given, argument, option
-from rsvib_torch.commands.shared_options import CameraOptions, RangeOptions, check_file, size_of
+from rsvib_torch.commands.shared_options import CameraOptions, check_file
 from rsvib_torch.commands.terminal import Answer, error_line, warn
 from rsvib_torch.files.reading import Table
-from rsvib_torch.options import BorderName, PixelFormat, TrackerOptions, method_options
+from rsvib_torch.options import PixelFormat, TrackerOptions, method_options
 from rsvib_torch.text import number_of
 
 if TYPE_CHECKING:
     from rsvib_torch.config import Config
 
-_AT_LEAST_2 = Annotated[int, Field(ge=2)]
-
 
 @options
-class LiveOptions(CameraOptions, RangeOptions):
+class LiveOptions(CameraOptions):
     """Options of ``live``."""
 
     source: str = argument()
@@ -43,8 +40,6 @@ class LiveOptions(CameraOptions, RangeOptions):
     """Size of the frames on standard input, e.g. 1024x768."""
     pixel_format: PixelFormat = "gray8"
     """Pixels of the frames on standard input."""
-    realtime: bool = False
-    """Read a file at its own rate, and drop frames like a camera."""
     tracker: Annotated[
         Table,
         Given(
@@ -54,35 +49,9 @@ class LiveOptions(CameraOptions, RangeOptions):
         ),
     ]
     steady: NotNegative = option(0.0, metavar="SECONDS")
-    """Stabilise the image to a straight line through the last part of its path (a camera; a file with --realtime)."""
-    border: BorderName = "mirror"
-    """Pixels that the sensor did not record: mirror, extrapolated; hold, as in the frame before; crop is available for
-    videos (rsvib run --video)."""
-    waiting: Count = 64
-    """Frames that wait before the oldest ones are dropped."""
-    num_frames: _AT_LEAST_2 | None = None
-    """Stop after this number of frames."""
-
-    @cached_property
-    def file(self) -> Path | None:
-        """The frames of a file that are used; None for the number or URL of a camera, and for standard input."""
-        if self.source == "-" or self.is_camera:
-            if self.frame_range is not None:
-                raise ValueError(f"--frames goes with a file, not with {self.source}; --num-frames ends a session")
-            return None
-        if not io.stack_files(self.source)[0].exists():
-            raise FileNotFoundError(f"{self.source}: no such file; a camera is a number or a URL")
-        return self.part_of(Path(self.source))
-
-    @property
-    def is_camera(self) -> bool:
-        """Whether the source is the number or URL of a camera."""
-        return self.source.isdecimal() or "://" in self.source
-
-    @property
-    def written(self) -> Path | None:
-        """The video; None for a pipe."""
-        return None if self.out is None or str(self.out) == "-" else self.out
+    """Stabilise the image to a straight line through the last part of its path."""
+    border: Literal["mirror", "hold"] = "mirror"
+    """Pixels that the sensor did not record: mirror, extrapolated; hold, as in the frame before."""
 
 
 def live_session(given: LiveOptions) -> Answer:
@@ -91,25 +60,31 @@ def live_session(given: LiveOptions) -> Answer:
     The source is never blocked: if frames come faster than they are processed, the oldest waiting ones are dropped and
     counted. Ctrl-C ends the session. The video can be played at any moment, also after a crash or on a full disk.
     """
-    settings = given.settings_for(None if given.file is None else Path(given.source), given.frame_range)
-    _check_options(given)
-    files = [] if given.written is None else [given.written]
-    inputs = [*([] if given.file is None else io.stack_files(given.file)), settings.path]
-    for path in files:
-        check_file(path, given.overwrite, inputs)
+    file = _file_of(given)
+    settings = given.settings_for(file)
+    written = [] if given.out is None or str(given.out) == "-" else [given.out]
+    for path in written:
+        check_file(path, given.overwrite, [*([] if file is None else io.stack_files(file)), settings.path])
     method: str = (settings.restoration | given.tracker).get("method", "dewarp")
     available = set(method_options(method)) - {"joint"}
     restoration = {name: value for name, value in settings.restoration.items() if name in available}
-    drops, source = given.file is None or given.realtime, _source(given, settings)
+    source = _source(given, file, settings)
     with _frames_on_standard_output(enabled=str(given.out) == "-") as stream:
-        outputs = _outputs(given, settings, stream)
-        shown = [output for output in outputs if isinstance(output, video.PageOutput)]
+        outputs: list[video.FrameOutput] = [
+            video.VideoOutput(path, settings.timing.frame_rate, overwrite=given.overwrite) for path in written
+        ]
+        outputs += [] if stream is None else [video.PipeOutput(stream)]
+        # the page is the last output, because it is the only one that is opened before the first frame
+        page = None if given.page is None else video.PageOutput(given.page)
+        if page is not None:
+            outputs.append(page)
+            error_line(f"the page is {page.url}", "note")
         tracker = tracking.VibrationTracker(
             settings.timing,
             **restoration | given.tracker | {"method": method},
             steady=given.steady,
             wobble=given.steady > 0,
-            full_scale=source.full_scale if given.full_scale is None or given.file else given.full_scale,
+            full_scale=source.full_scale if given.full_scale is None or file else given.full_scale,
             channels="first",
         )
         report = video.run_live(
@@ -117,10 +92,8 @@ def live_session(given: LiveOptions) -> Answer:
             tracker,
             outputs,
             border=video.VideoBorder(given.border),
-            drops=drops,
-            waiting=given.waiting,
-            max_frames=given.num_frames,
-            progress=_state_text(shown[0]) if shown else None,
+            drops=file is None,
+            progress=None if page is None else _state_text(page),
         )
     if report.frames == 0:
         raise ValueError(f"{given.source}: no frame was read")
@@ -129,46 +102,32 @@ def live_session(given: LiveOptions) -> Answer:
     parts = [f"{number_of(count, 'frame')} {why}" for why, count in missing.items() if count]
     if parts:
         warn("; ".join(parts))
-    return _answer(given.source, report, files, drops=drops)
+    return _answer(given.source, report, written, drops=file is None)
 
 
-def _source(given: LiveOptions, settings: Config) -> video.FrameSource:
-    if given.is_camera:
+def _file_of(given: LiveOptions) -> Path | None:
+    """The file of the frames; None for the number or URL of a camera, and for standard input."""
+    if (given.source == "-") != (given.size is not None):
+        raise ValueError("--size WIDTHxHEIGHT is required for raw frames on standard input (-), and only for them")
+    if given.source == "-" or given.source.isdecimal() or "://" in given.source:
+        return None
+    if not io.stack_files(given.source)[0].exists():
+        raise FileNotFoundError(f"{given.source}: no such file; a camera is a number or a URL")
+    return Path(given.source)
+
+
+def _source(given: LiveOptions, file: Path | None, settings: Config) -> video.FrameSource:
+    if file is not None:
+        scale = given.full_scale if given.full_scale is not None else settings.full_scale
+        return video.FileSource(file, settings.timing, scale)
+    if given.size is None:
         return video.CameraSource(int(given.source) if given.source.isdecimal() else given.source, settings.timing)
-    if given.file is None:
-        width, height = size_of(given.size or "", "WIDTHxHEIGHT in px such as 1024x768")
-        # not sys.stdin.buffer: Python aborts at the exit if a thread still waits in it
-        stream = os.fdopen(sys.stdin.fileno(), "rb", closefd=False)
-        return video.PipeSource(stream, (height, width), given.pixel_format, settings.timing)
-    scale = given.full_scale if given.full_scale is not None else settings.full_scale
-    return video.FileSource(given.file, settings.timing, scale, realtime=given.realtime)
-
-
-def _check_options(given: LiveOptions) -> None:
-    """Refuse options that do not go with the source."""
-    if given.source == "-" and given.size is None:
-        raise ValueError("--size WIDTHxHEIGHT is required for raw frames on standard input")
-    if given.source != "-" and given.size is not None:
-        raise ValueError(f"--size goes with frames on standard input (-), not with {given.source}")
-    if given.realtime and given.file is None:
-        raise ValueError(f"--realtime goes with a file, not with {given.source}: a camera has its own rate")
-    if given.border == "crop" or (given.steady > 0 and given.file is not None and not given.realtime):
-        option = "--border crop" if given.border == "crop" else "--steady of a file"
-        remedy = f"rsvib run FRAMES OUT --video --steady {given.steady:g} --border {given.border}"
-        raise ValueError(f"{option} needs frames that come later; process a video with {remedy}")
-
-
-def _outputs(given: LiveOptions, settings: Config, stream: BinaryIO | None) -> list[video.FrameOutput]:
-    outputs: list[video.FrameOutput] = []
-    if given.written is not None:
-        outputs.append(video.VideoOutput(given.written, settings.timing.frame_rate, overwrite=given.overwrite))
-    if stream is not None:
-        outputs.append(video.PipeOutput(stream))
-    if given.page is not None:  # the last one, because it is the only one that is opened before the first frame
-        served = video.PageOutput(given.page)
-        outputs.append(served)
-        error_line(f"the page is {served.url}", "note")
-    return outputs
+    width, _, height = given.size.partition("x")
+    if not (width.isdecimal() and height.isdecimal() and 0 < int(width) < 10**6 and 0 < int(height) < 10**6):
+        raise ValueError(f"--size must be WIDTHxHEIGHT in px such as 1024x768, got {given.size!r}")
+    # not sys.stdin.buffer: Python aborts at the exit if a thread still waits in it
+    stream = os.fdopen(sys.stdin.fileno(), "rb", closefd=False)
+    return video.PipeSource(stream, (int(height), int(width)), given.pixel_format, settings.timing)
 
 
 @contextmanager

@@ -12,11 +12,12 @@ import typer
 
 import rsvib_torch
 from rsvib_torch.checks.validation import MistakesError
-from rsvib_torch.commands import motion_commands, stack_commands
-from rsvib_torch.commands.export_command import export
+from rsvib_torch.commands import stack_commands
+from rsvib_torch.commands.calibrate_command import calibrate
 from rsvib_torch.commands.flat_command import flat_command
 from rsvib_torch.commands.init import cameras, init
 from rsvib_torch.commands.live_command import live_session
+from rsvib_torch.commands.restore_command import restore
 from rsvib_torch.commands.run_stack import run
 from rsvib_torch.commands.terminal import Answer, error_line, print_line, running, warnings_in_one_line
 
@@ -25,47 +26,32 @@ _COMMANDS: dict[str, Callable[..., Answer]] = {  # in the order of the help
     "cameras": cameras,
     "run": run,
     "detect": stack_commands.detect,
-    "restore": stack_commands.restore_frames,
-    "report": stack_commands.report,
-    "motion": motion_commands.motion,
-    "known": motion_commands.known,
-    "calibrate": motion_commands.calibrate,
+    "restore": restore,
+    "motion": stack_commands.motion,
+    "calibrate": calibrate,
     "live": live_session,
-    "export": export,
-    "simulate": stack_commands.simulate,
 }
 _EXAMPLES = """
   rsvib init frames.tif --row-time 14.6us --exposure 1/500 --frame-rate 29.97
   rsvib init clip.mp4 --camera "iPhone 12" --exposure 1/500
   rsvib cameras iphone 12
   rsvib cameras gopro --json
-  rsvib run frames.tif results --config camera.toml
+  rsvib run frames.tif results --config camera.toml --report
   rsvib run long.tif results --config camera.toml --memory 2GB --resume
   rsvib detect frames.tif --config camera.toml --out found
   rsvib detect frames.tif --config camera.toml --out found --overwrite --json
   rsvib restore frames.tif restored.tif --config camera.toml \\
         --vibration found/vibration.json
-  rsvib restore frames.tif still.tif --config camera.toml \\
-        --vibration found/vibration.json --joint all
-  rsvib report frames.tif report --config camera.toml
-  rsvib report frames.tif report --config camera.toml \\
-        --manifest results/manifest.json
   rsvib motion frames.tif --config camera.toml --out motion.csv
   rsvib motion frames.tif --config camera.toml --out swept.csv --model swept
-  rsvib known frames.tif restored.tif --config camera.toml \\
+  rsvib restore frames.tif restored.tif --config camera.toml \\
         --motion gyroscope.csv --unit rad/s --focal-length 1800
-  rsvib known frames.tif restored.tif --config camera.toml \\
-        --motion motion.csv --unit px --offset 0
   rsvib calibrate led.mp4 --frequency 1000 --frame-rate 29.97 \\
         --out camera.toml
-  rsvib calibrate long.png short.png --exposure 0.001 --exposure 0.00025
+  rsvib calibrate clip.mp4 --by-motion --frame-rate 30 --out camera.toml
   rsvib live 0 --config camera.toml --page 8080
   rsvib live rtsp://camera/stream --config camera.toml --out still.mkv \\
         --steady 1
-  rsvib export found/vibration.json clip.gcsv --frames clip.mp4 \\
-        --focal-length 1800
-  rsvib simulate scene.png frames.tif --config camera.toml
-  rsvib simulate scene.png frames.npy --config camera.toml --seed 2
 """
 _SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 120}  # characters
 
@@ -81,16 +67,7 @@ for _name, _function in _COMMANDS.items():
         context_settings=_SETTINGS,
     )(flat_command(_name, _function))
 
-_NO_MEMORY = "not enough memory for a stack of this size: process fewer frames at a time"
-# Lines that replace errors without a message for users, by a part of their type and text.
-_REPLACED = {
-    "RecursionError": "the input is nested too deeply",
-    "can't start new thread": "the system cannot start another thread: use fewer workers, or raise the limit of "
-    "processes (ulimit -u)",
-    "MemoryError": _NO_MEMORY,
-    "allocate": _NO_MEMORY,
-    "out of memory": _NO_MEMORY,
-}
+_OUT_OF_MEMORY = ("MemoryError", "allocate", "out of memory")  # parts of the types and texts of such errors
 _INTERRUPTED = 130  # exit code of typer after Ctrl-C; older versions raise Abort
 
 
@@ -141,8 +118,9 @@ def _lines_of(error: Exception) -> Sequence[str]:
         several = "; give a sequence of files as their folder" if "unexpected extra argument" in message else ""
         return [f"{message}{several}"]
     text = f"{type(error).__name__}: {' '.join(str(error).split())[:500]}"
-    replaced = [line for part, line in _REPLACED.items() if part in text]
-    return replaced[:1] or [f"unexpected {text} (--debug prints the traceback)"]
+    if any(part in text for part in _OUT_OF_MEMORY):
+        return ["not enough memory for a stack of this size: process fewer frames at a time"]
+    return [f"unexpected {text} (--debug prints the traceback)"]
 
 
 def main() -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import rsvib_torch
 from rsvib_torch import detection, io, stacks, video
 from rsvib_torch import frames as preparation
 from rsvib_torch import report as reports
@@ -12,18 +14,21 @@ from rsvib_torch.checks.validation import options
 from rsvib_torch.commands import answers
 from rsvib_torch.commands.flat_command import Given, argument
 from rsvib_torch.commands.shared_options import PixelSizeOptions, RestorationCommand, VerdictOptions
-from rsvib_torch.commands.stack_commands import print_notes, read_frame
-from rsvib_torch.commands.terminal import Answer, warn, working
+from rsvib_torch.commands.stack_commands import print_notes, read_frames
+from rsvib_torch.commands.terminal import Answer, current_output, warn, working
 from rsvib_torch.files.atomic import whole_folder
 from rsvib_torch.files.reading import Table
 from rsvib_torch.options import ProcessStackOptions, ProcessVideoOptions, WindowOptions
-from rsvib_torch.text import number_of
+from rsvib_torch.text import number_of, printable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from torch import Tensor
+
+    from rsvib_torch.detection import DetectionResult
 
 
-_RESULTS = (*answers.OF_DETECTION, *answers.OF_WINDOWS, "restoration.json", "before_after.png")
+_RESULTS = (*answers.OF_DETECTION, *answers.OF_WINDOWS, "restoration.json", "before_after.png", "report.html")
 _PROCESSING = ("resume", "compression", "memory", "workers", "scheduler")
 
 
@@ -40,6 +45,8 @@ class RunOptions(RestorationCommand, PixelSizeOptions, VerdictOptions):
     video: bool = False
     """Write a video: restored.mp4 (H.264) from .mp4, restored.mov from .mov, else restored.mkv (FFV1, without loss).
     Videos are followed frame by frame instead of in windows."""
+    report: bool = False
+    """Write report.html as well: a page with all figures and the sharpness before and after, of the first window."""
     moved: Annotated[
         Table,
         Given(
@@ -60,125 +67,160 @@ class RunOptions(RestorationCommand, PixelSizeOptions, VerdictOptions):
 def run(given: RunOptions) -> Answer:
     """Detect the vibration, restore the frames, judge the result.
 
-    Figures show both. Stacks of any length are processed in windows. If the restored frames are judged no better
-    than the input, the input is written unchanged, unless --force is given. Ctrl-C stops after the current windows;
-    --resume continues. With --video, the vibration of a video is followed frame by frame: --steady 1 --border crop
-    makes a shaky video steady.
+    Figures and, with --report, a page show both. Stacks of any length are processed in windows. If the restored frames
+    are judged no better than the input, the input is written unchanged, unless --force is given. Ctrl-C stops after the
+    current windows; --resume continues. With --video, the vibration of a video is followed frame by frame: --steady 1
+    --border crop makes a shaky video steady.
     """
-    settings, frames, out, output = given.settings, given.stack, given.out, given.output.removesuffix("/")
-    if given.moved and not given.video:
-        raise ValueError(f"--{next(iter(given.moved)).replace('_', '-')} goes with --video")
-    if "lens_profile" in given.moved and "gyroscope" not in given.moved:
-        raise ValueError("--lens-profile goes with --gyroscope")
-    if given.require_reliable and "gyroscope" in given.moved:
-        problem = "does not go with --gyroscope, which searches for no tones; leave one of them out"
-        raise ValueError(f"--require-reliable {problem}")
-    if given.video:
-        if output != "restored.tif":
-            raise ValueError(f"--video and --output {output} are two names for the restored stack; give one of them")
-        ending = io.split_range(frames)[0].suffix.lower()
-        output = f"restored{ending if ending in io.H264 else '.mkv'}"
-    if Path(output).name != output or output in ("", ".", ".."):
-        raise ValueError(f"--output must be a file name without a folder, got {output!r}")
-    answers.check_folder(out, _RESULTS, given.overwrite or "resume" in given.processing, given.inputs, out / output)
+    settings, frames, out, output = given.settings, given.frames, given.out, _name_of_output(given)
+    replaces = given.overwrite or "resume" in given.processing
+    answers.check_folder(out, _RESULTS, replaces, given.inputs, out / output)
     info, scale, restoration = given.planned_restoration(given.restoration)
     print_notes(info, settings)
     chosen = WindowOptions(**{**settings.stack, **given.windows})
     common = given.of_stack(scale, restoration)
-    # videos of more than one window are followed from frame to frame
-    if given.moved or (given.video and io.is_video(frames) and info.shape[0] > chosen.window):
-        answer = _run_followed(given, out / output, common)
+    # 1. Process windows, or a video of more than one window from frame to frame.
+    followed = bool(given.moved) or (given.video and io.is_video(frames) and info.shape[0] > chosen.window)
+    if followed:
+        result, shown = _process_video(given, out / output, info, common)
     else:
-        answer = _run_windows(given, out / output, info, common, chosen)
+        result, shown = _process_windows(given, out / output, info, common, chosen)
+    # 2. Figure, tables and page.
+    with whole_folder(out) as folder:
+        drawn = []
+        if len(shown.after):
+            with working("drawing the frames"):
+                reports.save_figure(_comparison(shown), folder / "before_after.png")
+            drawn = ["before_after.png"]
+        names = [output, *drawn, "manifest.json"] if followed else [*drawn, output, "manifest.json"]
+        answer = _describe(folder, given, result, shown, names)
+        if given.report:
+            pages = _write_page(folder, given, shown, answer)
+            answers.check_folder(out, pages, overwrite=True, inputs=given.inputs)
+            names = pages + names
+        elif result.restored:
+            step = f"write a page with all figures:\n  {current_output().command} --resume --report"
+            answer.next_steps.insert(0, step)
+    if followed:
+        _describe_video(answer, shown.stored, result)
     if given.overwrite:
-        answers.remove_old(out, _RESULTS, [path.name for path in answer.files])
+        answers.remove_old(out, _RESULTS, names)
+    answer.files += [out / name for name in names]
     return answer
 
 
-def _run_windows(given: RunOptions, restored: Path, info: io.StackInfo, common: Table, chosen: WindowOptions) -> Answer:
-    settings, frames, out = given.settings, given.stack, given.out
-    common |= {"window": chosen.window, "follow": chosen.follow, "force": given.force}
+def _name_of_output(given: RunOptions) -> str:
+    """Name of the restored stack."""
+    output = given.output.removesuffix("/")
+    if given.moved and not given.video:
+        raise ValueError(f"--{next(iter(given.moved)).replace('_', '-')} goes with --video")
+    if given.video:
+        if output != "restored.tif":
+            raise ValueError(f"--video and --output {output} are two names for the restored stack; give one of them")
+        ending = io.split_range(given.frames)[0].suffix.lower()
+        output = f"restored{ending if ending in io.H264 else '.mkv'}"
+    if Path(output).name != output or output in ("", ".", ".."):
+        raise ValueError(f"--output must be a file name without a folder, got {output!r}")
+    return output
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """Frames before and after restoration, for the figure and the page, and what is known of them."""
+
+    before: Tensor  # (T, H, W) or (T, C, H, W), full scale 1; of a mosaic in colour
+    after: Tensor  # the same frames restored or as taken, or one image of them; empty if none could be used
+    first: int  # number of the first one in the stack
+    was_restored: bool  # whether ``after`` is restored
+    timing: rsvib_torch.SensorTiming
+    stored: stacks.StackManifest  # all windows
+    detection: DetectionResult | None = None  # a vibration that was not followed
+    restoration: stacks.RestoredFrames | None = None  # its verdict
+    options: Table = field(default_factory=dict)  # of ``restore``
+
+    @property
+    def windows(self) -> stacks.StackManifest | None:
+        """The windows, unless one vibration of all frames is shown."""
+        return None if len(self.stored.windows) == 1 and self.detection is not None else self.stored
+
+
+def _process_windows(
+    given: RunOptions, restored: Path, info: io.StackInfo, common: Table, chosen: WindowOptions
+) -> tuple[stacks.StackReport, _Shown]:
+    """Process a stack in windows; the first one is shown."""
+    settings, frames, processing = given.settings, given.frames, given.processing
+    common = common | {"window": chosen.window, "follow": chosen.follow, "force": given.force}
     common["detection"] = None if chosen.follow is True else settings.detection  # a tracker has none
-    resources = {name: value for name, value in given.processing.items() if name in ("memory", "workers")}
-    counts = info.shape[0] > chosen.window
-    of_run = common | given.processing | {"bad_frames": chosen.bad_frames, "manifest": out / "manifest.json"}
+    manifest, counts = given.out / "manifest.json", info.shape[0] > chosen.window
+    of_run = common | processing | {"bad_frames": chosen.bad_frames, "manifest": manifest}
     with working(f"restoring {frames.name}", counts=counts) as progress:
         of_run["progress"] = progress if counts else None
         result = stacks.process_stack(frames, restored, settings.timing, **of_run)
     first = result.first
     if first is None:  # the run was complete before, or its first window was
+        resources = {name: value for name, value in processing.items() if name in ("memory", "workers")}
         first = next(iter(stacks.iterate_stack(frames, settings.timing, **common, **resources)))
     if result.bad_frames:
         warn(f"{number_of(result.bad_frames, 'frame')} could not be used: see manifest.json")
     answers.note_lost(restored, result.not_kept)
-    found, restoration = first.detection, first.restoration
-    names, more, steps = [restored.name, "manifest.json"], ["--manifest", str(out / "manifest.json")], []
-    with whole_folder(out) as folder:
-        if len(first.frames):
-            with working("drawing the frames"):
-                picture = folder / "before_after.png"
-                names = answers.draw_safely(picture, lambda: _comparison(given, common, first)) + names
-        # one vibration of all frames, which was not followed
-        if result.windows == 1 and restoration is not None and isinstance(found, detection.DetectionResult):
-            target, chosen_options = folder / "restoration.json", common["restoration"]
-            reports.write_restoration(target, restoration, chosen_options, result.not_kept)
-            timing = io.timing_from_first_frame(settings.timing, info)
-            names += [*answers.write_detection(folder, found, timing, given.pixel_size), "restoration.json"]
-            answers.warn_of_restoration(restoration)
-            answer = answers.stack_answer(frames, found, given.pixel_size, restoration, info.shape[0])
-            more, steps = [], answers.steps_after_detection(found, frames, settings)
-        else:
-            stored = stacks.read_manifest(out / "manifest.json")
-            names += answers.write_windows(folder, stored, given.pixel_size)
-            answer = answers.windows_answer(f"Vibration in {frames.name}", stored, result, given.pixel_size)
-    if result.restored:
-        steps.insert(0, answers.page_step(frames, out / "report", settings, *more))
-    if not given.video and io.is_video(frames) and result.restored < result.windows:
-        steps.insert(0, answers.run_step(frames, out / "followed", settings.arguments))
-    answer.next_steps += steps
-    answer.files += [out / name for name in names]
-    return answer
+    after, options = first.frames.cpu(), common["restoration"]
+    # the page shows all frames of the window, the figure one of them: of a joint image, that in the middle
+    indices = first.indices or [index for index in first.window.written if index not in first.bad_frames]
+    if not given.report:
+        middle = 0 if first.indices else len(indices) // 2
+        indices, after = indices[middle : middle + 1], after[:1]
+    before = read_frames(frames, indices, common["full_scale"]) if len(after) else after
+    if len(before) and options.get("mosaic") is not None:
+        before = preparation.colour_frames(before, options["mosaic"])
+    found = first.detection if isinstance(first.detection, detection.DetectionResult) else None
+    timing = io.timing_from_first_frame(settings.timing, info)
+    if found is not None and found.timing is not None and result.windows > 1:
+        timing = found.timing
+    shown = (before, after, next(iter(indices), 0), first.restored, timing, stacks.read_manifest(manifest))
+    return result, _Shown(*shown, detection=found, restoration=first.restoration, options=options)
 
 
-def _comparison(given: RunOptions, common: Table, first: stacks.WindowResult) -> Figure:
-    """Draw the first restored frame of a stack beside the frame of the input."""
-    index = first.indices[0] if first.indices else (first.window.first + first.window.last + 1) // 2
-    raw = read_frame(given.stack, index, common["full_scale"])
-    pattern = common["restoration"].get("mosaic")
-    if pattern is not None:
-        raw = preparation.colour_frames(raw[None], pattern)[0]
-    raw = preparation.enlarged(raw, first.frames.shape[-1] // raw.shape[-1])
-    names = ("input", "restored" if first.restored else "unchanged")
-    return reports.comparison_figure(raw, first.frames[0].cpu().nan_to_num(0.0), names=names)
-
-
-def _run_followed(given: RunOptions, restored: Path, common: Table) -> Answer:
-    """Process a video from frame to frame."""
-    settings, frames, out, restoration = given.settings, given.stack, given.out, common["restoration"]
-    changed = [name for name, value in given.windows.items() if value not in (False, "pass")]
-    changed += [name for name in ("scheduler", "compression") if name in given.processing]
-    changed += ["optics_sigma" if name == "optics" else name for name in stacks.options_of_windows(restoration)]
-    refused = ", ".join(f"--{name.replace('_', '-')}" for name in changed)
-    if refused:
-        remedy = "give --output restored.mp4 instead of --video, which processes windows"
-        raise ValueError(f"{refused} cannot be used with --video, which follows the frames one by one; {remedy}")
+def _process_video(
+    given: RunOptions, restored: Path, info: io.StackInfo, common: Table
+) -> tuple[stacks.StackReport, _Shown]:
+    """Process a video from frame to frame; two frames near its begin are shown."""
+    settings, frames, restoration = given.settings, given.frames, common["restoration"]
     if {**settings.restoration, **given.restoration}.get("saturation") is None:
         restoration.pop("saturation", None)  # that of integer formats
-    manifest = out / "manifest.json"
-    of_run = common | given.moved | given.processing | {"manifest": manifest}
+    manifest = given.out / "manifest.json"
+    of_run = common | given.moved | given.windows | given.processing | {"manifest": manifest}
     with working(f"restoring {frames.name}", counts=True) as progress:
         result = video.process_video(frames, restored, settings.timing, **of_run, progress=progress)
     stored = stacks.read_manifest(manifest)
-    index = min(8, io.read_stack_info(frames).shape[0] // 2)  # earlier ones must be decoded as well
+    bad = stored.bad_frames
+    pairs = (number for number in range(info.shape[0] - 1) if str(number) not in bad and str(number + 1) not in bad)
+    first = min(pairs, key=lambda number: abs(number - 8))  # earlier frames must be decoded as well
+    before = read_frames(frames, (first, first + 1), stored.settings["full_scale"])
+    if stored.margins is not None:
+        before = video.Margins(**stored.margins).cut(before)
+    after = read_frames(restored, (first, first + 1), None)
+    return result, _Shown(before, after, first, result.restored > 0, settings.timing, stored)
 
-    def comparison() -> Figure:
-        raw = read_frame(frames, index, stored.settings["full_scale"])
-        raw = raw if stored.margins is None else video.Margins(**stored.margins).cut(raw)
-        return reports.comparison_figure(raw, read_frame(restored, index, None))
 
-    drawn = answers.draw_safely(out / "before_after.png", comparison)
-    with whole_folder(out) as folder:
-        names = [restored.name, *drawn, "manifest.json", *answers.write_windows(folder, stored, given.pixel_size)]
+def _describe(folder: Path, given: RunOptions, result: stacks.StackReport, shown: _Shown, names: list[str]) -> Answer:
+    """Write the tables and figures of one vibration of all frames, or of the windows; their names are added."""
+    frames, found, judged = given.frames, shown.detection, shown.restoration
+    if shown.windows is None and found is not None and judged is not None:
+        reports.write_restoration(folder / "restoration.json", judged, shown.options, result.not_kept)
+        names += [*answers.write_detection(folder, found, shown.timing, given.pixel_size), "restoration.json"]
+        answers.warn_of_restoration(judged)
+        answer = answers.stack_answer(frames, found, given.pixel_size, judged, given.info.shape[0])
+        answer.next_steps = answers.steps_after_detection(found, frames, given.settings)
+    else:
+        names += answers.write_windows(folder, shown.stored, given.pixel_size)
+        answer = answers.windows_answer(f"Vibration in {frames.name}", shown.stored, result, given.pixel_size)
+    if not given.video and io.is_video(frames) and result.restored < result.windows:
+        answer.next_steps.insert(0, answers.run_step(frames, given.out / "followed", given.settings.arguments))
+    return answer
+
+
+def _describe_video(answer: Answer, stored: stacks.StackManifest, result: stacks.StackReport) -> None:
+    """Add what was found in a video to the answer, and warn of frames that are not better."""
     if result.bad_frames:
         bad = number_of(result.bad_frames, "frame")
         warn(f"{bad} could not be used and repeat the frame before: see manifest.json")
@@ -193,12 +235,40 @@ def _run_followed(given: RunOptions, restored: Path, common: Table) -> Answer:
     if worse:
         where = f"{len(worse)} of {number_of(result.windows, 'part')} of the video"
         warn(f"the restored frames are judged worse than the input in {where}: {worse[0].summary}")
-    answer = answers.windows_answer(f"Vibration in {frames.name}", stored, result, given.pixel_size)
     for name, where in (("frame_to_frame", "from frame to frame"), ("rows", "between the rows of a frame")):
         if stored.shaking is not None:
             before, after = stored.shaking[name]
             answer.results["Restoration"].append(f"shaking {where}: {before:.2g} px rms, {after:.2g} px afterwards")
     answer.data["shaking"] = stored.shaking
-    answer.files += [out / name for name in names]
-    answer.next_steps.append(answers.page_step(frames, out / "report", settings, "--manifest", manifest))
-    return answer
+
+
+def _comparison(shown: _Shown) -> Figure:
+    """Draw a frame before and after restoration."""
+    before = shown.before[0 if len(shown.after) == len(shown.before) else len(shown.before) // 2]
+    raw = preparation.enlarged(before, shown.after.shape[-1] // before.shape[-1])
+    names = ("input", "restored" if shown.was_restored else "unchanged")
+    return reports.comparison_figure(raw, shown.after[0].nan_to_num(0.0), names=names)
+
+
+def _write_page(folder: Path, given: RunOptions, shown: _Shown, answer: Answer) -> list[str]:
+    """Write the page, and return the names of its files."""
+    if not len(shown.after) or (shown.detection is None and not shown.stored.is_followed):
+        warn("report.html is not written: the vibration of the first window is not known")
+        return []
+    judged = shown.restoration
+    page = reports.Report(
+        title=printable(f"Vibration in {given.frames.name}"),
+        subtitle=printable(f"{given.frames}, camera of {given.settings.source}"),
+        made_with=f"rsvib_torch {rsvib_torch.__version__}: {current_output().command}",
+        windows=shown.windows,
+        frames=shown.before,
+        restored=shown.after if shown.was_restored else None,
+        timing=shown.timing,
+        detection=shown.detection,
+        verdict=None if judged is None else judged.verdict,
+        first=shown.first,
+        next_steps=answer.next_steps,
+        texts={title: "\n".join(lines) for title, lines in answer.results.items()},
+    )
+    with working("writing the page"):
+        return reports.write_report_page(folder, page)

@@ -1,9 +1,8 @@
 """Arguments and options that several commands share, and their combination with the configuration file."""
 
 import os
-import re
 import statistics
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from fractions import Fraction
 from functools import cached_property
@@ -61,33 +60,20 @@ def rate(text: str) -> float:
     return _with_unit(text, {"": 1}, "a number such as 29.97 or 30000/1001")
 
 
-def _of_form(pattern: str, expected: str) -> Callable[[str], str]:
-    """Parser of a text of a form, which returns it as it was given."""
-
-    def parse(text: str) -> str:
-        if re.fullmatch(pattern, text) is None:
-            raise typer.BadParameter(f"expected {expected}, got {text!r}")
-        return text
-
-    return parse
-
-
-_range_of_frames = _of_form(r"\d*:\d*", "START:END such as 100:200, 100: or :200")
-_axes = _of_form(rf"({'|'.join(AXES)})(,({'|'.join(AXES)}))*", "axes such as x,y or x,y,roll,zoom")
-
-
-def size_of(text: str, expected: str) -> tuple[int, int]:
-    """Two numbers of px with an x between them, from ``--size``."""
-    match = re.fullmatch(r"([1-9]\d{0,5})x([1-9]\d{0,5})", text.strip().lower())
-    if match is None:
-        raise ValueError(f"--size must be {expected}, got {text!r}")
-    return int(match[1]), int(match[2])
+def _axes(text: str) -> str:
+    """Names of axes with commas between them."""
+    if not set(text.split(",")) <= set(AXES):
+        raise typer.BadParameter(f"expected axes such as x,y or x,y,roll,zoom, got {text!r}")
+    return text
 
 
 TIME: Table = {"parser": seconds, "metavar": "TIME"}  # form of an option
 # Forms of the keys of [sensor] that are options.
 SENSOR_FORMS: dict[str, Table] = {
-    "row_time": {"text": "Time between the exposure starts of adjacent rows, e.g. 14.6us or 1.46e-5.", **TIME},
+    "row_time": {
+        "text": "Time from one row to the next, e.g. 14.6us, or 15/1080ms of a readout of 1080 rows.",
+        **TIME,
+    },
     "exposure_time": {"names": ["--exposure"], "text": "Exposure time, e.g. 1/500 or 2ms.", **TIME},
     "frame_rate": {
         "text": "Frames per second of the sensor, e.g. 29.97 or 30000/1001.",
@@ -98,20 +84,6 @@ SENSOR_FORMS: dict[str, Table] = {
     "scan_axis": {},
     "readout_direction": {},
 }
-
-
-@options
-class RangeOptions:
-    """A part of the frames of a stack."""
-
-    frame_range: str | None = option(
-        None, "--frames", parser=_range_of_frames, metavar="START:END", show_default="all frames"
-    )
-    """Use only the frames START to END - 1, counted from 0; times count from the first of them."""
-
-    def part_of(self, path: Path) -> Path:
-        """The path of a stack, or of the frames that are used of it, ``NAME[START:END]``."""
-        return path if self.frame_range is None else path.with_name(f"{path.name}[{self.frame_range}]")
 
 
 @options
@@ -138,21 +110,14 @@ class CameraOptions:
     config: Path | None = None
     """TOML file that describes the camera; rsvib init writes one. Or give --row-time, --exposure and --frame-rate."""
     sensor: Annotated[Table, Given(SensorSection, default="from the configuration", forms=SENSOR_FORMS)]
-    readout_time: float | None = option(None, **TIME)
-    """Time in which all rows of a frame are read, e.g. 15ms, in place of --row-time."""
     full_scale: float | None = option(None, show_default="from the file, or the configuration")
     """Count of an integer format that corresponds to full scale, e.g. 4095 for 12 bits."""
     overwrite: bool = False
     """Replace results that exist already."""
 
-    def settings_for(self, frames: Path | None, frame_range: str | None = None) -> Config:
+    def settings_for(self, frames: Path | None) -> Config:
         """Configuration file and the options that replace its keys, or these alone and what the frames state."""
         sensor = self.sensor
-        if self.readout_time is not None:
-            if self.config is not None or "row_time" in sensor or frames is None:
-                raise ValueError("--readout-time replaces --row-time of frames in a file, and goes without --config")
-            shape = io.read_stack_info(frames).shape
-            sensor = sensor | {"row_time": self.readout_time / shape[-1 if sensor.get("scan_axis") == "x" else -2]}
         if self.config is None and frames is not None and "row_time" in sensor:
             exposure = None if "exposure_time" in sensor else stated_exposure(frames)
             sensor = sensor | ({} if exposure is None else {"exposure_time": exposure})
@@ -166,14 +131,13 @@ class CameraOptions:
                 "such a file and explains its values)"
             )
         settings = read_config(self.config, sensor=sensor)
-        if frames is not None and "frame_rate" in self.sensor and settings.timing.frame_start_times is None:
+        starts, used = settings.timing.frame_start_times, None if frames is None else io.split_range(frames)[1]
+        if starts is not None and used is not None:  # those of the configuration count from frame 0 of the file
+            part = starts[slice(*used)] or starts
+            relative = tuple(float(start - part[0]) for start in part)
+            settings = replace(settings, timing=replace(settings.timing, frame_start_times=relative))
+        elif starts is None and frames is not None and "frame_rate" in self.sensor:
             settings = replace(settings, timing=_evenly_timed(settings.timing, io.read_stack_info(frames)))
-        starts = settings.timing.frame_start_times
-        if frame_range is not None and starts is not None:  # those of the file are read with its frames
-            first, _, end = frame_range.partition(":")
-            used = list(starts)[int(first or 0) : int(end) if end else None]
-            relative = tuple(float(start - used[0]) for start in used)
-            settings = replace(settings, timing=replace(settings.timing, frame_start_times=relative or starts))
         arguments = [] if self.config is None else ["--config", str(self.config)]
         for name, value in sensor.items():
             arguments += [_TIMES.get(name, f"--{name.replace('_', '-')}")]
@@ -184,26 +148,22 @@ class CameraOptions:
 
 
 @options
-class StackCommand(RangeOptions, CameraOptions, DeviceOptions):
+class StackCommand(CameraOptions, DeviceOptions):
     """A command that reads a stack of frames."""
 
     frames: Path = argument()
-    """Stack of frames: TIFF, .npy, HDF5, Zarr, video, or a folder of PNG, TIFF or JPEG files."""
-
-    @cached_property
-    def stack(self) -> Path:
-        """The path of the frames that are used."""
-        return self.part_of(self.frames)
+    """Stack of frames: TIFF, .npy, HDF5, Zarr, video, or a folder of PNG, TIFF or JPEG files. NAME[100:200] are
+    its frames 100 to 199, from the first of which times count."""
 
     @cached_property
     def settings(self) -> Config:
         """The camera and the options of the configuration."""
-        return self.settings_for(self.frames, self.frame_range)
+        return self.settings_for(self.frames)
 
     @cached_property
     def info(self) -> "StackInfo":
         """What the file of the frames states."""
-        return io.read_stack_info(self.stack)
+        return io.read_stack_info(self.frames)
 
     @cached_property
     def scale(self) -> float | None:
@@ -212,17 +172,14 @@ class StackCommand(RangeOptions, CameraOptions, DeviceOptions):
         if self.full_scale is not None or not self.info.is_integer:
             return self.full_scale
         if stated is None and configured is None:
-            unknown = f"{self.stack}: the full scale of its {self.info.dtype} counts is not known"
+            unknown = f"{self.frames}: the full scale of its {self.info.dtype} counts is not known"
             raise ValueError(f"{unknown}: give --full-scale, e.g. 4095 for 12 bits, or full_scale in [sensor]")
-        if stated is not None and self.info.dtype != "uint8" and configured not in (None, stated):
-            both = f"{stated:g} in the file and {configured:g} in the configuration"
-            raise ValueError(f"{self.stack}: the full scale is {both}; choose one with --full-scale")
         return configured if stated is None else stated
 
     @property
     def inputs(self) -> list[Path]:
         """Files that are read."""
-        return [*io.stack_files(self.stack), *([] if self.config is None else [self.config])]
+        return [*io.stack_files(self.frames), *([] if self.config is None else [self.config])]
 
     def of_stack(self, scale: float | None, restoration: Table) -> Table:
         """Options that the functions for stacks have in common."""
@@ -249,40 +206,11 @@ class RestorationCommand(StackCommand):
                     "frames (of each window).",
                     "kind": str,
                 },
-                "optics": {
-                    "names": ["--optics-sigma"],
-                    "text": "Standard deviation of the Gaussian blur of the lens in px, before pixels without gaps: "
-                    "restored frames are sharpened to half a point of their grid. Section [restoration.optics] "
-                    "describes other optics.",
-                    "kind": float,
-                },
             },
         ),
     ]
     force: bool = False
     """Write the restored frames even if they are judged no better than the input."""
-
-
-@options
-class RestoredStack(StackCommand):
-    """A command that writes a restored stack of a name, and its manifest beside it."""
-
-    restored: Path = argument()
-    """Stack to write, with the data type and full scale of the input. The extension selects the format; .mp4 and .mkv
-    are videos with the time stamps and the sound of the input."""
-
-    @property
-    def manifest(self) -> Path:
-        """What was detected and restored in each window."""
-        return self.restored.with_name(f"{self.restored.name}.manifest.json")
-
-    def planned_stack(self, given: Mapping[str, object]) -> "tuple[StackInfo, float | None, Table]":
-        """``planned_restoration``, of which the restored stack can be written."""
-        info, scale, options = self.planned_restoration(given)
-        shape = info.restored_as(options.get("scale", 1), options.get("mosaic")).shape
-        shape = (1, *shape[1:]) if options.get("joint") is True else shape
-        io.check_stack_target(self.restored, shape, dtype=info.dtype, full_scale=scale, like=info)
-        return info, scale, options
 
 
 @options
@@ -317,12 +245,12 @@ def _evenly_timed(timing: SensorTiming, info: "StackInfo") -> SensorTiming:
     if stated is None or even is None or even == stated:
         return timing
     note(f"equal intervals by --frame-rate replace the {info.time_source} of {info.path}, which are irregular")
-    return replace(timing, frame_start_times=even)
+    return replace(timing, frame_start_times=tuple(time - even[0] for time in even))
 
 
 def stated_exposure(path: Path) -> float | None:
     """Exposure in s that the track of a GoPro video states, the median over its frames."""
-    track = gyroscope.read_camera_track(path)
+    track = gyroscope.read_camera_track(io.split_range(path)[0])
     if track is None or not len(track.exposures):
         return None
     exposures: list[float] = track.exposures.tolist()
@@ -358,8 +286,6 @@ def _restoration_options(info: "StackInfo", full_scale: float | None, options: T
     method: str = (options | given).get("method", "exact")
     if method != options.get("method", "exact"):  # other options belong to the configured method
         options = {name: value for name, value in options.items() if name in ("saturation", *method_options(method))}
-    if "optics" in given:
-        given["optics"] = {"pixel": 1.0, **options.get("optics", {}), "sigma": given["optics"]}
     if "joint" in given:
         if given["joint"] != "all" and not (given["joint"].isdecimal() and int(given["joint"]) >= 1):
             raise ValueError(f"--joint must be 'all' or a number of frames, got {given['joint']!r}")

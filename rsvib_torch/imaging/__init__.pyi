@@ -1,7 +1,6 @@
 from .blur import RowPSF, RowVaryingBlur, blur_rows, blur_rows_adjoint, row_psf, trajectory_psf
 from .sensor_model import Optics, SensorNoise
 from .simulate import simulate_frames
-from .simulation_section import SimulationSection
 from .trajectory import exposure_nodes, exposure_trajectory, gauss_node_count, rows_showing
 
 __all__ = [
@@ -9,7 +8,6 @@ __all__ = [
     "RowPSF",
     "RowVaryingBlur",
     "SensorNoise",
-    "SimulationSection",
     "blur_rows",
     "blur_rows_adjoint",
     "exposure_nodes",

@@ -207,7 +207,7 @@ def camera_mode(name: str, *, width: int, height: int, frame_rate: float) -> Cam
             for mode in sorted(modes, key=lambda mode: mode not in sized)
         )
         # of 151 pairs of modes of one size with different rates, 96 have readout times within 5 %
-        other = "try --readout-time of a known rate, which is right for two of three cameras, or " if sized else ""
+        other = "try the readout time of a known rate, which is right for two of three cameras, or " if sized else ""
         raise ValueError(
             f"no mode of {modes[0].brand} {modes[0].model} has the aspect, rate and nearly the size of "
             f"{width} x {height} px at {rate:.4g}/s: {known}; {other}measure the row time (rsvib calibrate)"

@@ -7,7 +7,6 @@ from .plots import offset_figure as offset_figure
 from .plots import psf_figure as psf_figure
 from .plots import save_figure as save_figure
 from .plots import windows_figure as windows_figure
-from .results import check_same_timing as check_same_timing
 from .results import motion_columns as motion_columns
 from .results import read_vibration as read_vibration
 from .results import restoration_data as restoration_data

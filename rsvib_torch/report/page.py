@@ -1,4 +1,4 @@
-"""The page of ``rsvib report``: verdict, frames before and after, figures, and what the program prints, in one file."""
+"""The page of ``rsvib run --report``: verdict, frames before and after, figures, and what the program prints, in one file."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -58,6 +58,8 @@ def headline(report: Report) -> tuple[str, str]:
     """Overall result: ``"good"``, ``"doubt"`` or ``"bad"``, which selects its colour, and its sentence."""
     result, unchanged = report.detection, report.restored is None
     totals: Table = {} if report.windows is None else report.windows.totals()
+    if result is None and unchanged:
+        return "doubt", "No vibration was found that can be removed; the frames are unchanged."
     if result is None:
         text = "The vibration was followed from frame to frame, and removed, by rsvib run; the page shows two frames."
         return "good" if totals["outcomes"].get("helps") == totals["windows"] else "doubt", text

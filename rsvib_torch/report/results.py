@@ -49,7 +49,7 @@ def read_vibration(path: str | os.PathLike[str], timing: SensorTiming | None = N
     if data.get("format") != DetectionResult.file_format:
         raise ValueError(
             f"{path}: not a vibration.json, but a file of the format {quoted(data.get('format'))}; give the "
-            "vibration.json, or the manifest.json of windows, that rsvib detect or run wrote"
+            "vibration.json that rsvib detect or run wrote (rsvib run restores windows)"
         )
     result = result_of(DetectionResult, data, Path(path))
     if result.batch_shape:

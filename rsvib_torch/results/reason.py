@@ -109,7 +109,7 @@ class Reason:
 _COMPARED = ("value", "limit")
 # What texts of Python name, and the same for users of the program
 _OPTIONS = {
-    "follow_vibration": "--follow",
+    "follow_vibration": "rsvib run --follow",
     "detect_motion": "rsvib motion",
     "check frame_rows, row_time": "check --frame-rate, --row-time",
     "check exposure_rows": "check --exposure",

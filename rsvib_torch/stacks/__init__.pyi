@@ -1,7 +1,6 @@
 from .corrector import CorrectedFrames as CorrectedFrames
 from .corrector import VibrationCorrector as VibrationCorrector
 from .job import WindowResult as WindowResult
-from .job import options_of_windows as options_of_windows
 from .job import restore_block as restore_block
 from .manifest import StackManifest as StackManifest
 from .manifest import read_manifest as read_manifest
@@ -14,7 +13,6 @@ from .recorded_motion import check_stack_motion as check_stack_motion
 from .recorded_motion import mask_of_regions as mask_of_regions
 from .run_folder import StackReport as StackReport
 from .window_restoration import RestoredFrames as RestoredFrames
-from .window_restoration import may_change as may_change
 from .window_restoration import restore_trusted as restore_trusted
 from .window_restoration import without_data as without_data
 from .windows import Window as Window

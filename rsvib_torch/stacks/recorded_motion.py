@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks.values import refused
 from rsvib_torch.gyroscope.alignment import ClockAlignment, FittedClock, MotionCheck, align_motion, check_motion
 from rsvib_torch.gyroscope.corner_tracks import corner_tracks
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
@@ -50,12 +49,10 @@ def mask_of_regions(regions: Sequence[str], size: tuple[int, int]) -> Tensor | N
     for region in regions:
         if not re.fullmatch(r"\d*:\d*(,\d*:\d*)?", region):
             form = "rows, or rows and columns, such as 400: or :60,500:"
-            raise refused(ValueError, "ignore", f"must be {form}, got {region!r}")
+            raise ValueError(f"ignore must be {form}, got {region!r}")
         part = mask[tuple(slice(*(int(end) if end else None for end in ends.split(":"))) for ends in region.split(","))]
         if part.numel() == 0:
-            raise refused(
-                ValueError, "ignore", f"{region} has no pixel of frames of {size[0]} rows and {size[1]} columns"
-            )
+            raise ValueError(f"ignore {region} has no pixel of frames of {size[0]} rows and {size[1]} columns")
         part.fill_(True)
     return mask if regions else None
 

@@ -422,8 +422,6 @@ for _name, _words in {
     "10^5 unknown keys": "".join(f"a{n} = 1\n" for n in range(10**5)),
     "number of 10^6 digits": "x = " + "9" * 10**6,
     "exponent": _CAMERA.replace("1e-4", "1e-999999999"),
-    "10^9 frames": _CAMERA + "[simulation]\nnum_frames = 1000000000\n[simulation.vibration]\n"
-    "amplitude = [1.0, 1.0]\nfrequency = [50.0, 50.0]\n",
     "zero bytes": "\0" * 10**6,
 }.items():
     CASES[f"TOML: {_name}"] = partial(_data, "a.toml", _words)
@@ -455,12 +453,7 @@ def attempt(folder: Path, path: Path) -> str:
     os.chdir(path.parent)
     name = path.name
     if name.endswith(".toml"):
-        config = read_config(path)
-        if config.simulation is not None:
-            scene = np.random.default_rng(0).random((96, 96), np.float32)
-            rsv.simulate_frames(
-                scene, config.timing, config.simulation.vibration.to_vibration(), config.simulation.num_frames
-            )
+        read_config(path)
     elif name.endswith(".csv"):
         rsv.read_motion(path, unit="px")
     elif name.endswith(".vibration.json"):

@@ -16,15 +16,6 @@ from small_stack import CAMERA
 import rsvib_torch as rsv
 from rsvib_torch.commands.main import run_command
 
-_SIMULATION = """
-[simulation]
-num_frames = 2
-frame_size = [48, 48]
-[simulation.vibration]
-amplitude = [1.0, 1.0]
-frequency = [100.0, 120.0]
-"""
-
 
 def _write_originals(folder: Path, source: Path) -> None:
     """Inputs of all kinds."""
@@ -32,8 +23,7 @@ def _write_originals(folder: Path, source: Path) -> None:
     counts = tifffile.imread(source)[:4]
     for name in ("frames.tif", "pngs", "frames.zarr", "frames.npy", "frames.h5", "frames.mkv"):
         write_stack(folder / name, counts)
-    write_stack(folder / "scene.png", counts[:1])
-    (folder / "camera.toml").write_text(CAMERA + _SIMULATION)
+    (folder / "camera.toml").write_text(CAMERA)
     times = "\n".join(f"{0.001 * index},0.1,0.2" for index in range(100))
     (folder / "motion.csv").write_text(f"time,x,y\n{times}\n")
     shutil.copy(source.with_name("vibrations.json"), folder / "vibrations.json")
@@ -84,20 +74,17 @@ def _attempts(place: Path) -> Iterator[tuple[str, Callable[..., None], tuple[obj
         source = place / stack
         for alias, output in _aliases(source).items():
             yield command(f"restore {stack}: {alias}", "restore", source, output, *config, *vibration)
-            yield command(f"known {stack}: {alias}", "known", source, output, *config, *known)
+            yield command(f"known {stack}: {alias}", "restore", source, output, *config, *known)
             yield f"process_stack {stack}: {alias}", _processed, (source, output, None)
             yield f"write_stack like {stack}: {alias}", _written, (str(source), str(output))
     folders = {"the input": place / "pngs", "a folder in it": place / "pngs" / "out", "the folder of it": place}
     for alias, out in folders.items():
         yield command(f"run pngs: {alias}", "run", place / "pngs", out, *config)
         yield command(f"detect pngs: {alias}", "detect", place / "pngs", "--out", out, *config)
-        yield command(f"detect in windows: {alias}", "detect", place / "pngs", "--out", out, "--window", 3, *config)
-        yield command(f"report pngs: {alias}", "report", place / "pngs", out, *config)
+        yield command(f"page of pngs: {alias}", "run", place / "pngs", out, "--report", *config)
     for stack in ("frames.tif", "frames.npy", "frames.mkv"):
         arguments = (place / stack, place, "--output", stack, *config)
         yield command(f"run {stack}: --output is the input", "run", *arguments)
-    for alias, output in _aliases(place / "scene.png").items():
-        yield command(f"simulate: {alias}", "simulate", place / "scene.png", output, *config)
     for stack in ("frames.tif", "pngs"):
         for alias, output in _aliases(place / stack, ending=".csv").items():
             yield command(f"motion: {alias}", "motion", place / stack, "--out", output, *config)
@@ -105,11 +92,6 @@ def _attempts(place: Path) -> Iterator[tuple[str, Callable[..., None], tuple[obj
             yield command(f"calibrate: {alias}", "calibrate", place / stack, *light)
             camera = ("--row-time", "1e-4", "--exposure", "6e-4", "--frame-rate", 130, "--out", output, config[2])
             yield command(f"init: {alias}", "init", place / stack, *camera)
-    good = (place / "frames.tif", place / "restored.tif")
-    reports = ("frames.tif", "camera.toml", "vibrations.json", "restored.tif", "pngs/../restored.tif")
-    for name in reports:
-        report = ("--report", place / name)
-        yield command(f"restore --report {name}", "restore", *good, *config, *vibration, *report)
     for alias, output in _aliases(place / "camera.toml").items():
         yield command(f"motion: camera.toml, {alias}", "motion", place / "frames.tif", "--out", output, *config)
     for manifest in ("frames.tif", "restored.tif", "pngs/manifest.json"):
@@ -119,7 +101,7 @@ def _attempts(place: Path) -> Iterator[tuple[str, Callable[..., None], tuple[obj
     shutil.copy(place / "frames.zarr" / "zarr.json", place / "tree.zarr")
     shutil.copy(place / "frames.tif", place / "tree.zarr")
     inside = place / "tree.zarr" / "frames.tif"
-    yield command("known: folder around the input", "known", inside, place / "tree.zarr", *config, *known)
+    yield command("known: folder around the input", "restore", inside, place / "tree.zarr", *config, *known)
     yield "process_stack: folder around the input", _processed, (inside, place / "tree.zarr", None)
 
 

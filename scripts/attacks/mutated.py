@@ -39,17 +39,6 @@ _TIMES = "frame_start_times = [0.0, 0.0104, 0.0208]\n"
 CONFIG = (
     CAMERA.replace("[detection]", _TIMES + "[detection]")
     + """
-[simulation]
-num_frames = 3
-seed = 1
-
-[simulation.vibration]
-amplitude = [3.1, 5.2]
-frequency = [[50.0, 60.0], [30.0, 20.0]]
-
-[simulation.noise]
-read_noise = 0.003
-
 [stack]
 window = 4
 bad_frames = "skip"

@@ -107,11 +107,11 @@ def nested():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: FRAMES.to("meta"), "frames must be a tensor with data"),
-        (nested, "frames must be a dense tensor, got a nested tensor"),
-        (FRAMES.to_sparse, r"frames must be a dense tensor.*to_dense"),
+        (lambda: FRAMES.to("meta"), "frames must be a dense tensor that has data, got .* on meta"),
+        (nested, "frames must be a dense tensor that has data, got a nested tensor"),
+        (FRAMES.to_sparse, "frames must be a dense tensor that has data, got torch.sparse"),
         (lambda: FRAMES.to(torch.complex64), "frames must be real numbers"),
-        (lambda: FRAMES.to(torch.float8_e4m3fn), "frames must have at least 16 bits"),
+        (lambda: FRAMES.to(torch.float8_e4m3fn), "frames must be real numbers of at least 16 bits"),
         (lambda: FRAMES.numpy().astype(object), "frames must be a tensor or array of numbers"),
         (lambda: np.ma.masked_invalid(FRAMES.numpy()), "frames must not be a masked array"),
         (object, "frames must be a tensor or array of numbers"),

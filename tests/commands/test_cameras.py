@@ -10,7 +10,7 @@ import av
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
-from program import Terminal, refused, rsvib
+from program import refused, rsvib
 
 import rsvib_torch as rsv
 from rsvib_torch.config import read_config
@@ -86,7 +86,7 @@ def test_table_has_no_row_that_contradicts_itself():
             "iPhone 12",
             (1920, 1080, 60),
             "no mode .* at 60/s: 1920 x 1080 px at 24/s Ultra Wide .readout 15.7 ms., 1920 x 1080 px at 24/s Wide "
-            ".readout 6.6 ms., 3840 x 2160 px .*; try --readout-time of a known rate",
+            ".readout 6.6 ms., 3840 x 2160 px .*; try the readout time of a known rate",
         ),
         ("iPhone 12", (640, 360, 60), ": 3840 x 2160 px at 60/s .readout 4.98 ms., .*; measure the row time"),
         ("iPhone 12", (3840, 2160, 30), "no mode of Apple iPhone 12"),  # another rate
@@ -147,15 +147,6 @@ def test_camera_that_a_video_names(capsys, tags, camera):
     assert f'--camera "{camera}" takes row time' in error
     assert rsvib("init", "clip.mp4", "--exposure", "1ms", "--camera", camera) == 0
     assert sensor()["row_time"] == pytest.approx(15.52e-3 / 2160, rel=0.01)
-
-
-def test_row_time_of_the_named_camera_is_proposed_in_a_terminal(monkeypatch):
-    write_clip(size=(2160, 3840), tags={"com.android.manufacturer": "Apple", "com.android.model": "iPhone 7 Plus"})
-    monkeypatch.setattr("sys.stdin", Terminal("\n1ms\n"))  # the proposal is accepted
-    monkeypatch.setattr("sys.stderr", Terminal())
-    assert rsvib("init", "clip.mp4") == 0
-    assert sensor()["row_time"] == pytest.approx(15.52e-3 / 2160, rel=1e-3)
-    assert sensor()["row_time_std"] == pytest.approx(0.03 * sensor()["row_time"], rel=0.01)
 
 
 @pytest.mark.parametrize("kind", ["jpg", "png"])

@@ -1,4 +1,4 @@
-"""--frames START:END: every command that reads frames uses a part of them."""
+"""NAME[START:END]: every command that reads frames uses a part of them."""
 
 import numpy as np
 import pytest
@@ -8,8 +8,6 @@ from program import refused, rsvib
 from small_stack import CAMERA, draw_counts
 
 import rsvib_torch as rsv
-
-RANGE = ("--frames", "5:9")
 
 
 @pytest.fixture(scope="module", name="place")
@@ -38,11 +36,11 @@ def test_a_part_is_used_like_a_file_that_holds_nothing_else(place, tmp_path, mon
     """The time origin is frame 5."""
     monkeypatch.chdir(place)
     written = []
-    for frames, more in (("frames.tif", RANGE), ("part.tif", ())):
+    for frames in ("frames.tif[5:9]", "part.tif"):
         out = tmp_path / frames
         out.mkdir()
         given = (part.format(out) for part in arguments)
-        assert rsvib(name, frames, *given, "--config", "camera.toml", *more) == 0
+        assert rsvib(name, frames, *given, "--config", "camera.toml") == 0
         is_video = output.endswith("mkv")  # a file has the time of writing
         written.append(rsv.read_stack(out / output).numpy() if is_video else (out / output).read_bytes())
     np.testing.assert_array_equal(*written)
@@ -52,8 +50,8 @@ def test_stated_start_times_are_those_of_the_part(place, tmp_path):
     starts = [104e-4 * frame + 3e-3 * (frame > 6) for frame in range(12)]
     config = tmp_path / "camera.toml"
     config.write_text(CAMERA.replace("frame_rows = 104", f"frame_rows = 104\nframe_start_times = {starts}"))
-    arguments = ("--config", config, "--out", tmp_path / "found", *RANGE)
-    assert rsvib("detect", place / "frames.tif", *arguments) == 0
+    arguments = ("--config", config, "--out", tmp_path / "found")
+    assert rsvib("detect", place / "frames.tif[5:9]", *arguments) == 0
     stored = rsv.DetectionResult.load(tmp_path / "found" / "vibration.json").timing.frame_start_times
     assert list(stored) == pytest.approx([start - starts[5] for start in starts[5:9]])
 
@@ -61,14 +59,13 @@ def test_stated_start_times_are_those_of_the_part(place, tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("5", "expected START:END such as 100:200, 100: or :200, got '5'"),
         ("5:90", "frames.tif: frames 5:90 of a stack of 12 frames; expected START:END with START < END <= 12"),
         ("12:", "frames.tif: frames 12: of a stack of 12 frames"),
     ],
 )
 def test_wrong_ranges_are_refused_in_one_line(place, tmp_path, capsys, text, message):
-    arguments = ("--config", place / "camera.toml", "--frames", text)
-    error = refused(capsys, "detect", place / "frames.tif", "--out", tmp_path / "found", *arguments)
+    arguments = ("--config", place / "camera.toml")
+    error = refused(capsys, "detect", place / f"frames.tif[{text}]", "--out", tmp_path / "found", *arguments)
     assert message in error
     assert not (tmp_path / "found").exists()
 

@@ -1,14 +1,14 @@
-"""rsvib init: configuration files for the camera of a stack, and presets."""
+"""rsvib init: configuration files for the camera of a stack."""
 
 import tomllib
 
 import numpy as np
 import pytest
 import torch
-from program import Terminal, refused, rsvib
+from program import refused, rsvib
 from small_video import write_video
 
-from rsvib_torch.config import presets, read_config
+from rsvib_torch.config import read_config
 from rsvib_torch.io import StackInfo, write_stack
 
 TIMES = ("--row-time", "40us", "--exposure", "1/1250")
@@ -70,14 +70,12 @@ def test_frame_times_and_full_scale_of_the_file(place, frames, capsys):
     assert "--frame-rate is 50, the times in the file give 25" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("factor", "likely"), [(1, "4095"), (16, "65520")])
-def test_unknown_full_scale_is_suggested(place, frames, capsys, factor, likely):
-    np.save("f.npy", (frames * 4000).numpy().astype(np.uint16) * np.uint16(factor))
+def test_unknown_full_scale_is_required(place, frames, capsys):
+    np.save("f.npy", (frames * 4000).numpy().astype(np.uint16))
     error = refused(capsys, "init", "f.npy", *TIMES, *RATE)
     assert error.startswith("rsvib: error: --full-scale is missing.")
-    assert f"Frame 0 indicates {likely}." in error
-    assert init("f.npy", *TIMES, *RATE, "--full-scale", likely) == 0
-    assert read_config(place / "camera.toml").full_scale == float(likely)
+    assert init("f.npy", *TIMES, *RATE, "--full-scale", 4095) == 0
+    assert read_config(place / "camera.toml").full_scale == 4095
 
 
 def test_missing_values_are_explained_in_one_line_each(place, frames, capsys):
@@ -95,40 +93,12 @@ def test_missing_values_are_explained_in_one_line_each(place, frames, capsys):
     assert not (place / "camera.toml").exists()
 
 
-def test_questions_in_a_terminal(place, frames, monkeypatch):
-    np.save("f.npy", (frames * 1000).numpy().astype(np.uint16))
-    answers = ["soon", "25", "40", "40us", "2", "1/1250", ""]
-    monkeypatch.setattr("sys.stdin", Terminal("\n".join(answers) + "\n"))
-    shown = Terminal()
-    monkeypatch.setattr("sys.stderr", shown)
-    assert init("f.npy") == 0
-    config = read_config(place / "camera.toml")
-    assert (config.timing.frame_rate, config.timing.row_time, config.timing.exposure_time) == pytest.approx(
-        (25, 4e-5, 8e-4)
-    )
-    assert config.full_scale == 1023
-    text = shown.getvalue()
-    assert "expected a number such as 29.97 or 30000/1001, got 'soon'" in text
-    assert "at most 0.000625 s; units such as us can be added; got '40'" in text
-    assert "at most 0.04 s" in text
-    assert "Here it is less than 625 us." in text
-
-
-def test_end_of_the_answers_writes_nothing(place, frames, monkeypatch, capsys):
-    write_stack("f.npy", frames)
-    monkeypatch.setattr("sys.stdin", Terminal("25\n"))
-    monkeypatch.setattr("sys.stderr", Terminal())
-    assert init("f.npy") == 130
-    assert not (place / "camera.toml").exists()
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         (("--row-time", "40"), "row_time=40 s is longer than 10 ms; row_time is in seconds (40 us is 40e-6)"),
         (("--row-time", "600us"), "with 29.97 frames/s, row_time is at most 0.000521354 s"),
         (("--frame-rate", "0.033"), "frame_rate=0.033 is less than 0.1; it is in frames per second"),
-        (("--preset", "iso12233"), "give no frames and no values of the sensor with it"),
         (("--out", "none/camera.toml"), "folder"),
     ],
 )
@@ -151,24 +121,3 @@ def test_typical_mistakes_are_warned_of(place, frames, capsys, row_time, message
     write_stack("f.npy", frames)
     assert init("f.npy", "--row-time", row_time, "--exposure", "1ms", *RATE) == 0
     assert message in capsys.readouterr().err
-
-
-def test_presets(place, frames, capsys):
-    assert init("--list-presets") == 0
-    shown = capsys.readouterr().out.splitlines()
-    assert shown[0] == "Presets"
-    assert [line.split(":")[0].strip() for line in shown[1:] if line] == list(presets())
-    assert shown[2].endswith("a rolling-shutter camera in front of an ISO 12233 chart.")
-    assert list(place.iterdir()) == []
-    assert init("--preset", "in_orbit") == 0
-    assert (place / "camera.toml").read_text() == presets()["in_orbit"]
-    for arguments, message in (
-        (("--preset", "push_scan"), "results exist already in"),
-        (("--preset", "moon", "--overwrite"), "--preset must be one of in_orbit, iso12233, push_scan; got 'moon'"),
-        ((), "give a stack of frames, or --preset NAME"),
-        (("none.mp4", *TIMES, "--out", "c.toml"), "none.mp4 does not exist"),
-    ):
-        assert message in refused(capsys, "init", *arguments)
-    assert (place / "camera.toml").read_text() == presets()["in_orbit"]
-    assert init("--preset", "push_scan", "--overwrite") == 0
-    assert (place / "camera.toml").read_text() == presets()["push_scan"]

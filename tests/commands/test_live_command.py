@@ -56,25 +56,23 @@ def test_from_pipe_to_pipe(clip, monkeypatch, capfdbinary):
     assert f"{COUNT} frames in".encode() in shown.err
 
 
-def test_a_file_at_its_own_rate(clip, capsys):
-    assert rsvib("live", clip, *CAMERA[:4], "--realtime", "--page", 0, "--border", "hold", "--steady", 0.2) == 0
+def test_a_steady_image_on_the_page(clip, capsys):
+    assert rsvib("live", clip, *CAMERA[:4], "--page", 0, "--border", "hold", "--steady", 0.2) == 0
     shown = capsys.readouterr()
     assert "per second, from the times in" in shown.out  # the frame rate of the file
     assert "rsvib: note: the page is http://127.0.0.1:" in shown.err
-    assert "delay: " in shown.out
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("-",), "--size WIDTHxHEIGHT is required for raw frames on standard input"),
-        (("0", "--realtime"), "--realtime goes with a file, not with 0"),
-        (("0", "--frames", "5:9"), "--frames goes with a file, not with 0; --num-frames ends a session"),
+        (("-",), "--size WIDTHxHEIGHT is required for raw frames on standard input (-), and only for them"),
+        (("0", "--size", "8x8"), "--size WIDTHxHEIGHT is required for raw frames on standard input (-), and only for"),
+        (("-", "--size", "8"), "--size must be WIDTHxHEIGHT in px such as 1024x768, got '8'"),
         (("none.mp4",), "none.mp4: no such file; a camera is a number or a URL"),
         (("CLIP", "--out", "still.gif"), "a live video is written to .mp4, .mov, .m4v or .mkv"),
         (("CLIP", "--out", "CLIP", "--overwrite"), "it is the input"),
-        (("CLIP", "--steady", "1"), "rsvib run FRAMES OUT --video --steady 1 --border mirror"),
-        (("0", "--border", "crop"), "--border crop needs frames that come later"),
+        (("0", "--border", "crop"), "'crop' is not one of 'mirror', 'hold'"),
     ],
 )
 def test_wrong_options_are_refused_in_one_line(clip, arguments, message, capsys, tmp_path, monkeypatch):

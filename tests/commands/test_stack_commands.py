@@ -9,8 +9,7 @@ import tifffile
 from program import refused, rsvib
 from small_stack import CAMERA, HEIGHT, STILL, WIDTH, write_small
 
-from rsvib_torch import read_stack, read_stack_info, write_stack
-from rsvib_torch.datasets import example_frames
+from rsvib_torch import read_stack, read_stack_info
 
 FRAMES = 13
 CONFIG = CAMERA + "[stack]\nwindow = 4\n"
@@ -70,47 +69,31 @@ def test_run_of_a_long_stack(place, tmp_path, capsys):
     assert 1 < gain["lowest"] <= gain["highest"] < 40
 
 
-def test_detect_in_windows_then_restore(place, tmp_path, capsys):
-    options = ("--config", place / "camera.toml")
-    assert rsvib("detect", place / "frames.tif", *options, "--out", tmp_path / "found", "--memory", "1GB") == 0
-    names = ["manifest.json", "tones.csv", "windows.json", "windows.png"]
-    assert sorted(path.name for path in (tmp_path / "found").iterdir()) == names
-    manifest = tmp_path / "found" / "manifest.json"
-    assert rsvib("restore", place / "frames.tif", tmp_path / "r.tif", *options, "--vibration", manifest) == 0
-    assert (tmp_path / "r.tif").read_bytes() == (place / "out" / "restored.tif").read_bytes()
-    other = tmp_path / "other.toml"
-    other.write_text(CONFIG.replace("frame_rows = 104", "frame_rows = 105"))
-    for config, more, message in (
-        (other, (), "the vibration was detected with another timing: frame_rows=104.0 (here 105.0)"),
-        (place / "camera.toml", ("--report", tmp_path / "report.json"), "--report needs a vibration.json"),
-    ):
-        arguments = ("--config", config, "--vibration", manifest, *more)
-        assert message in refused(capsys, "restore", place / "frames.tif", tmp_path / "o.tif", *arguments)
+def test_files_that_are_no_vibration_are_refused(place, tmp_path, capsys):
+    for vibration, message in (("manifest.json", "rsvib run restores windows"), ("windows.png", "not a vib")):
+        options = ("--config", place / "camera.toml", "--vibration", place / "out" / vibration)
+        assert message in refused(capsys, "restore", place / "frames.tif", tmp_path / "o.tif", *options)
     assert not (tmp_path / "o.tif").exists()
 
 
 def test_a_required_axis_that_is_not_reliable_is_exit_code_3(place, tmp_path, capsys):
     """In one window or in several; the results are those without the option. Other windows may be reliable."""
-    options, detect = ("--config", place / "camera.toml"), ("detect", place / "frames.tif")
-    for window in (4, 13):
-        found = (*detect, *options, "--window", window, "--overwrite", "--out", tmp_path / "found")
-        assert rsvib(*found, "--require-reliable", "x,y") == 0
+    options, found = ("--config", place / "camera.toml"), tmp_path / "found"
+    assert rsvib(*command(place, found, "--require-reliable", "x,y")) == 0
+    found = ("detect", place / "frames.tif", *options, "--overwrite", "--out", found)
+    assert rsvib(*found, "--require-reliable", "x,y") == 0
     counts = tifffile.imread(place / "frames.tif")
     counts[6:] = np.random.default_rng(0).integers(0, 4095, counts[6:].shape)
     tifffile.imwrite(tmp_path / "noise.tif", counts, photometric="minisblack", metadata=None)
-    for command in (("run", tmp_path / "noise.tif", tmp_path / "out"), ("report", tmp_path / "noise.tif", tmp_path)):
-        capsys.readouterr()
-        assert rsvib(*command, *options, "--require-reliable", "y") == 3
-        shown = capsys.readouterr()
-        assert "--require-reliable: y not reliable" in shown.err
-        assert "Files" in shown.out
+    capsys.readouterr()
+    assert rsvib("run", tmp_path / "noise.tif", tmp_path / "out", *options, "--require-reliable", "y") == 3
+    shown = capsys.readouterr()
+    assert "--require-reliable: y not reliable" in shown.err
+    assert "Files" in shown.out
     assert rsvib(*found, "--require-reliable", "x,roll") == 3
-    motion = ("motion", tmp_path / "noise.tif", *options, "--search", 6, "--frames", "6:10", "--model", "swept")
+    motion = ("motion", tmp_path / "noise.tif[6:10]", *options, "--search", 6, "--model", "swept")
     assert rsvib(*motion, "--out", tmp_path / "motion.csv", "--require-reliable", "x") == 3
     assert "expected axes such as x,y" in refused(capsys, *found, "--require-reliable", "z")
-    video = ("run", place / "frames.tif", tmp_path / "v", *options, "--video", "--gyroscope", "auto")
-    video = (*video, "--require-reliable", "x")
-    assert "--require-reliable does not go with --gyroscope" in refused(capsys, *video)
 
 
 def test_interrupted_run_is_resumed_or_refused(place, tmp_path, capsys, monkeypatch):
@@ -155,28 +138,14 @@ def test_errors_are_one_line_and_leave_no_files(place, tmp_path, capsys, options
     assert list(tmp_path.iterdir()) == []
 
 
-def test_readout_time_replaces_the_row_time(tmp_path, capsys):
-    frames, timing, _ = example_frames()
-    write_stack(tmp_path / "frames.npy", frames)
-    readout = f"{1e3 * timing.row_time * frames.shape[-2]}ms"
-    camera = ("--exposure", timing.exposure_time, "--frame-rate", timing.frame_rate, "--readout-time", readout)
-    detect = ("detect", tmp_path / "frames.npy", *camera, "--out", tmp_path / "found")
-    assert rsvib(*detect) == 0
-    stored = json.loads((tmp_path / "found" / "vibration.json").read_text())["timing"]
-    assert stored["row_time"] == pytest.approx(timing.row_time)
-    message = "--readout-time replaces --row-time of frames in a file, and goes without --config"
-    assert message in refused(capsys, *detect, "--row-time", "100us", "--overwrite")
-
-
 def test_raw_frames_behind_colour_filters_on_a_finer_grid(tmp_path):
-    """With keys of the configuration in windows, and as a report with options of the command."""
+    """In windows, with the page of the first one."""
     raw, out, config = tmp_path / "raw.tif", tmp_path / "out", tmp_path / "mosaic.toml"
     write_small(raw, frames=5)  # of a grey scene
     config.write_text(CAMERA.partition("[restoration]")[0] + MOSAIC)
-    assert rsvib("run", raw, out, "--config", config, "--workers", 1) == 0
+    assert rsvib("run", raw, out, "--config", config, "--workers", 1, "--report") == 0
     assert read_stack_info(out / "restored.tif").shape == (2, 3, 2 * HEIGHT, 2 * WIDTH)
     written = read_stack(out / "restored.tif")[0, :, ::2, ::2].double().numpy()
     assert np.sqrt(np.mean((written - STILL)[:, 12:-12, 12:-12] ** 2)) < 0.06
     assert (out / "before_after.png").exists()
-    assert rsvib("report", raw, tmp_path / "page", "--config", config) == 0
-    assert "which have 2 x 2 points per px" in (tmp_path / "page" / "report.html").read_text()
+    assert "which have 2 x 2 points per px" in (out / "report.html").read_text()

@@ -200,7 +200,7 @@ def test_commands_write_the_results_of_a_rolling_camera(rolling, tmp_path, capsy
     (tmp_path / "camera.toml").write_text(text)
     write_stack(tmp_path / "frames.tif", rolling[1].clamp(0, 1), dtype="uint16", full_scale=4095)
     config = ("--config", tmp_path / "camera.toml")
-    assert rsvib("report", tmp_path / "frames.tif", tmp_path / "page", *config, "--json") == 0
+    assert rsvib("run", tmp_path / "frames.tif", tmp_path / "page", *config, "--report", "--json") == 0
     answer = json.loads(capsys.readouterr().out)
     assert answer["detection"]["reliable"] == [True, True, True]
     assert answer["detection"]["vibration"]["amplitude"][2][0] == pytest.approx(2.5e-3, rel=0.03)

@@ -117,18 +117,21 @@ def test_clock_offsets_beyond_the_recording_are_reported(frames, tmp_path):
 def test_command_refuses_a_motion_that_enlarges_the_offsets_unless_forced(frames, gyroscope, tmp_path, capsys):
     (tmp_path / "camera.toml").write_text(CONFIG)
     rsv.write_stack(tmp_path / "frames.tif", frames)
-    known = ("known", tmp_path / "frames.tif", tmp_path / "out.tif", "--config", tmp_path / "camera.toml")
-    arguments, focal = (*known, "--motion", gyroscope, "--unit", "rad/s"), ("--focal-length", 900)
-    for more, message in (
-        ((*focal, "--offset", 813.35), "the frames need"),
-        ((*focal, "--offset", CLOCK, "--flip-x", "--flip-y"), "x: rows are further apart"),
-        ((*focal, "--flip-x"), "does not explain"),
-        ((), "needs a focal_length"),
-        ((*focal, "--time-unit", "us"), "check time_unit='us'"),
+    known = ("restore", tmp_path / "frames.tif", tmp_path / "out.tif", "--config", tmp_path / "camera.toml")
+    arguments, focal = (*known, "--unit", "rad/s", "--motion"), ("--focal-length", 900)
+    header, *lines = gyroscope.read_text().splitlines()
+    signs = [f"{time},{-float(x)},{-float(y)}" for time, x, y in (line.split(",") for line in lines)]
+    (tmp_path / "opposite.csv").write_text("\n".join([header, *signs]))
+    opposite = (*arguments, tmp_path / "opposite.csv", *focal)
+    for command, message in (
+        ((*arguments, gyroscope, *focal, "--offset", 813.35), "the frames need"),
+        ((*opposite, "--offset", CLOCK), "x: rows are further apart"),
+        (opposite, "does not explain"),
+        ((*arguments, gyroscope), "needs a focal_length"),
     ):
-        assert message in refused(capsys, *arguments, *more)
+        assert message in refused(capsys, *command)
         assert not (tmp_path / "out.tif").exists()
-    assert rsvib(*arguments, *focal, "--offset", CLOCK, "--flip-x", "--flip-y", "--force") == 0
+    assert rsvib(*opposite, "--offset", CLOCK, "--force") == 0
     assert "y: rows are further apart" in capsys.readouterr().err
     assert (tmp_path / "out.tif").exists()
 

@@ -65,7 +65,7 @@ def test_messages_have_at_most_twenty_lines(tmp_path):
     assert len(str(caught.value).splitlines()) == 21
 
 
-@pytest.mark.parametrize("option", ["--row-time", "--frames"])
+@pytest.mark.parametrize("option", ["--row-time", "--frame-rate"])
 def test_messages_do_not_repeat_long_options(tmp_path, capsys, option):
     (tmp_path / "a.toml").write_text(f"[sensor]\n{'key' * 10**5} = [{'1, ' * 10**5}]\nrow_time = '{'1' * 10**5}'\n")
     assert run_command(["init", str(tmp_path / "a.tif"), option, "1" * 10**5]) == 2

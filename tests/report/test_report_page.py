@@ -11,7 +11,7 @@ import detections
 import numpy as np
 import pytest
 import torch
-from program import refused, rsvib
+from program import rsvib
 
 from rsvib_torch.datasets import resolution_chart
 from rsvib_torch.imaging import SensorNoise, simulate_frames
@@ -215,9 +215,8 @@ def make_place(tmp_path_factory):
 
 
 def test_command_writes_a_page(place):
-    frames, config, out, found = (str(place / n) for n in ("chart & <co>.tif", "camera.toml", "out", "windows"))
-    assert rsvib("detect", frames, "--out", found, "--config", config, "--window", 2) == 0
-    arguments = ["report", frames, out, "--config", config, "--manifest", str(place / "windows" / "manifest.json")]
+    frames, config, out = (str(place / name) for name in ("chart & <co>.tif", "camera.toml", "out"))
+    arguments = ["run", frames, out, "--config", config, "--report"]
     assert rsvib(*arguments) == 0
     text = "".join(read(place / "out" / "report.html").text)
     assert "Vibration in chart & <co>.tif" in text
@@ -227,11 +226,3 @@ def test_command_writes_a_page(place):
     assert float(found[2]) == pytest.approx(71.0, rel=0.002)
     assert (place / "out" / "psf.png").exists()
     assert shlex.join(["rsvib", *arguments]) in text
-    assert "1 of 1" in text[text.index("reliable windows") :]
-    assert (place / "out" / "windows.png").exists()
-
-
-def test_command_refuses_manifests_in_one_line(place, capsys):
-    given = (place / "chart & <co>.tif", place / "refused", "--config", place / "camera.toml", "--manifest=no.json")
-    assert "no.json" in refused(capsys, "report", *given)
-    assert not (place / "refused").exists()

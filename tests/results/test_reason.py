@@ -64,7 +64,7 @@ def test_the_program_names_its_own_options():
     reason = Reason("rows_unexplained", "x", 0.2, 0.05)
     assert "use follow_vibration if the vibration changes, try more tones or detect_motion" in str(reason)
     with options_of_the_program():
-        assert "use --follow if the vibration changes, try more tones or rsvib motion" in str(reason)
+        assert "use rsvib run --follow if the vibration changes, try more tones or rsvib motion" in str(reason)
         assert "check --frame-rate, --row-time" in str(reason)
         followed = with_remedy([reason], "use frames at shorter intervals")[0]
         assert str(followed).endswith("0.05 px are allowed; use frames at shorter intervals")

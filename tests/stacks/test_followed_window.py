@@ -7,13 +7,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from program import refused, rsvib
+from program import rsvib
 from refusals import refuses
 from small_stack import stop_after
 from truth import Curve, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
-from rsvib_torch.stacks import read_manifest
+from rsvib_torch.stacks import detect_stack, read_manifest
 
 TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=12, frame_rows=500)
 CAMERA = ["--row-time", "100us", "--exposure", "1.2ms", "--frame-rate", "20"]
@@ -181,9 +181,8 @@ def test_two_steady_tones_near_the_frame_rate_are_not_reliable_and_wrong():
 
 
 def test_windows_state_the_vibration_of_their_frames(place, tmp_path):
-    options = ("--window", 14, "--follow", "--frames", "0:20", "--out", tmp_path / "found")
-    assert rsvib("detect", place / "frames.npy", *CAMERA, *options) == 0
-    manifest = read_manifest(tmp_path / "found" / "manifest.json")
+    detect_stack(place / "frames.npy[0:20]", tmp_path / "manifest.json", TIMING, window=14, follow=True)
+    manifest = read_manifest(tmp_path / "manifest.json")
     assert len(manifest.detections()) == 20
     assert [frame for record in manifest.windows for frame in record.followed] == list(range(20))
     table = manifest.table()
@@ -216,7 +215,7 @@ def test_bad_frames_are_written_as_taken_and_the_others_followed(place, tmp_path
 
 
 def test_run_follows_a_vibration_that_changes_without_an_option(place, tmp_path, capsys):
-    assert rsvib("run", place / "frames.npy", tmp_path / "run", *CAMERA) == 0
+    assert rsvib("run", place / "frames.npy", tmp_path / "run", *CAMERA, "--report") == 0
     shown = " ".join(capsys.readouterr().out.split())
     assert "the tones change within" in shown
     assert "followed from frame to frame" in shown
@@ -241,21 +240,13 @@ def test_run_follows_a_vibration_that_changes_without_an_option(place, tmp_path,
     assert sizes[0] > 3 * sizes[-1]
     restored = rsv.read_stack(tmp_path / "run" / "restored.tif").numpy()
     assert sum(decibel(restored[index], STILL) > 40 for index in range(FRAMES)) >= FRAMES - 4
-    shown = ("--manifest", tmp_path / "run" / "manifest.json")
-    assert rsvib("report", place / "frames.npy", tmp_path / "page", *CAMERA, *shown, "--method", "dewarp") == 0
-    answer = " ".join(capsys.readouterr().out.split())
-    assert f"{FRAMES} frames restored" in answer
-    assert "--follow if" not in answer  # the remedy of a steady vibration
-    page = (tmp_path / "page" / "report.html").read_text(encoding="utf-8")
+    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
     assert "followed from frame to frame, and removed, by rsvib run" in page
-    manifest = tmp_path / "run" / "manifest.json"
-    again = ("restore", place / "frames.npy", tmp_path / "again.npy", *CAMERA, "--vibration", manifest)
-    assert "repeat rsvib run" in refused(capsys, *again)
 
 
 def test_following_is_refused_where_it_is_switched_off(place, tmp_path, capsys):
-    part = place / "frames.npy"
-    assert rsvib("run", part, tmp_path / "steady", *CAMERA, "--frames", "0:12", "--no-follow") == 0
+    part = place / "frames.npy[0:12]"
+    assert rsvib("run", part, tmp_path / "steady", *CAMERA, "--no-follow") == 0
     shown = " ".join(capsys.readouterr().out.split())
     assert "0 restored" in shown
     assert "--follow" in shown

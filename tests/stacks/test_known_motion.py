@@ -68,7 +68,7 @@ def test_parts_that_are_fixed_to_the_camera_do_not_count(place, tmp_path):
 
 
 def test_a_long_stack_is_restored_in_windows_with_a_recording(place, tmp_path, capsys):
-    arguments = ("known", place / "frames.npy", tmp_path / "out.npy", *CAMERA, "--unit", "px", "--device", "cpu")
+    arguments = ("restore", place / "frames.npy", tmp_path / "out.npy", *CAMERA, "--unit", "px", "--device", "cpu")
     assert rsvib(*arguments, "--motion", place / "motion.csv", "--json") == 0
     answer = json.loads(capsys.readouterr().out)
     assert (answer["restoration"]["windows"], answer["restoration"]["restored"]) == (9, 9)

@@ -76,7 +76,7 @@ def test_a_fisheye_lens(place, tmp_path, capsys):
     (tmp_path / "lens.json").write_text(json.dumps(profile))
     write_clip(tmp_path / "clip.mp4", take(TIMING, SHAKING, count=16, fisheye=lens["distortion_coeffs"]))
     steadied = (*steady_command(tmp_path / "clip.mp4", tmp_path), "--lens-profile", tmp_path / "lens.json")
-    assert "--lens-profile goes with --gyroscope" in refused(capsys, *steadied)
+    assert "lens_profile belongs to a gyroscope: give gyroscope as well" in refused(capsys, *steadied)
     assert rsvib(*steadied, "--gyroscope", place / "rates.csv") == 0
     assert shaking(tmp_path / "out" / "restored.mp4") < 0.15  # 0.54 without, or the alignment is refused
     assert rsv.read_manifest(tmp_path / "out" / "manifest.json").gyroscope["focal_length"] == FOCAL_LENGTH
@@ -101,7 +101,7 @@ def test_the_track_of_the_clip_itself(place, tmp_path, capsys):
 
 def test_rates_of_another_camera_are_refused(place, tmp_path, capsys):
     write_rates(tmp_path / "other.csv", unrelated_rates(rates_of_clip().times))
-    arguments = (*steady_command(place / "clip.mp4", tmp_path), "--frames", "0:10")
+    arguments = steady_command(place / "clip.mp4[0:10]", tmp_path)
     assert "does not fit the video" in refused(capsys, *arguments, "--gyroscope", tmp_path / "other.csv")
     assert [path.name for path in tmp_path.iterdir()] == ["other.csv"]
 
