@@ -1,4 +1,4 @@
-"""The page of ``rsvib run --report``: verdict, frames before and after, figures, and what the program prints, in one file."""
+"""The page of ``rsvib run --report``: verdict, frames before and after, figures and texts, in one file."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
