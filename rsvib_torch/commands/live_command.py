@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +17,7 @@ from rsvib_torch.checks.validation import Count, NotNegative, options
 from rsvib_torch.commands.answers import detection_data
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.shared_options import CameraOptions, RangeOptions, check_file, size_of
-from rsvib_torch.commands.terminal import Answer, error_line, warn
+from rsvib_torch.commands.terminal import Answer, warn
 from rsvib_torch.files.reading import Table
 from rsvib_torch.options import BorderName, PixelFormat, TrackerOptions, method_options
 from rsvib_torch.text import number_of
@@ -37,8 +36,6 @@ class LiveOptions(CameraOptions, RangeOptions):
     """Number or URL of a camera, - for raw frames on standard input, or a file with frames."""
     out: Path | None = None
     """Video to write (.mp4, .mov, .m4v, .mkv), or - for raw frames to stdout."""
-    page: Annotated[int, Field(ge=0, le=65535)] | None = option(None, metavar="PORT")
-    """Show the restored frames at http://127.0.0.1:PORT."""
     size: str | None = option(None, metavar="WIDTHxHEIGHT")
     """Size of the frames on standard input, e.g. 1024x768."""
     pixel_format: PixelFormat = "gray8"
@@ -103,7 +100,6 @@ def live_session(given: LiveOptions) -> Answer:
     drops, source = given.file is None or given.realtime, _source(given, settings)
     with _frames_on_standard_output(enabled=str(given.out) == "-") as stream:
         outputs = _outputs(given, settings, stream)
-        shown = [output for output in outputs if isinstance(output, video.PageOutput)]
         tracker = tracking.VibrationTracker(
             settings.timing,
             **restoration | given.tracker | {"method": method},
@@ -120,7 +116,6 @@ def live_session(given: LiveOptions) -> Answer:
             drops=drops,
             waiting=given.waiting,
             max_frames=given.num_frames,
-            progress=_state_text(shown[0]) if shown else None,
         )
     if report.frames == 0:
         raise ValueError(f"{given.source}: no frame was read")
@@ -164,10 +159,6 @@ def _outputs(given: LiveOptions, settings: Config, stream: BinaryIO | None) -> l
         outputs.append(video.VideoOutput(given.written, settings.timing.frame_rate, overwrite=given.overwrite))
     if stream is not None:
         outputs.append(video.PipeOutput(stream))
-    if given.page is not None:  # the last one, because it is the only one that is opened before the first frame
-        served = video.PageOutput(given.page)
-        outputs.append(served)
-        error_line(f"the page is {served.url}", "note")
     return outputs
 
 
@@ -182,22 +173,6 @@ def _frames_on_standard_output(*, enabled: bool) -> Iterator[BinaryIO | None]:
     with os.fdopen(os.dup(sys.stdout.fileno()), "wb", buffering=0) as frames:
         sys.stdout = sys.stderr
         yield frames
-
-
-def _state_text(page: video.PageOutput) -> Callable[[tracking.TrackedFrame, video.LiveReport], None]:
-    """Text below the frames of the page, twice per second."""
-    due = 0.0
-
-    def show(tracked: tracking.TrackedFrame, report: video.LiveReport) -> None:
-        nonlocal due
-        if time.perf_counter() < due:
-            return
-        due = time.perf_counter() + 0.5  # s
-        lines = [f"time {tracked.time:.2f} s, {tracked.state}, {report.frames} frames written"]
-        lines += [] if tracked.detection is None else [tracked.detection.summary()]
-        page.show_state("\n".join(lines))
-
-    return show
 
 
 def _answer(source: str, report: video.LiveReport, files: list[Path], *, drops: bool) -> Answer:

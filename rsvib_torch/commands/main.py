@@ -58,7 +58,7 @@ _EXAMPLES = """
   rsvib calibrate led.mp4 --frequency 1000 --frame-rate 29.97 \\
         --out camera.toml
   rsvib calibrate long.png short.png --exposure 0.001 --exposure 0.00025
-  rsvib live 0 --config camera.toml --page 8080
+  rsvib live 0 --config camera.toml --out still.mp4
   rsvib live rtsp://camera/stream --config camera.toml --out still.mkv \\
         --steady 1
   rsvib export found/vibration.json clip.gcsv --frames clip.mp4 \\

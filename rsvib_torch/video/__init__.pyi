@@ -1,4 +1,4 @@
-from .frame_outputs import FrameOutput, PageOutput, PipeOutput, VideoOutput
+from .frame_outputs import FrameOutput, PipeOutput, VideoOutput
 from .process_video import process_video
 from .session import LiveReport, run_live
 from .sources import CameraSource, FileSource, FrameSource, PipeSource, TimedFrame
@@ -11,7 +11,6 @@ __all__ = [
     "FrameSource",
     "LiveReport",
     "Margins",
-    "PageOutput",
     "PipeOutput",
     "PipeSource",
     "TimedFrame",
