@@ -98,7 +98,6 @@ from .tracking import TrackedFrame as TrackedFrame
 from .tracking import VibrationTracker as VibrationTracker
 from .tracking import follow_vibration as follow_vibration
 from .video import Margins as Margins
-from .video import VideoBorder as VideoBorder
 from .video import process_video as process_video
 
 __version__: str

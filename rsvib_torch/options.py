@@ -39,7 +39,7 @@ FilePath = str | os.PathLike[str] | None
 OptionTable = Mapping[str, Any] | None
 Detections = Sequence[Any] | None  # entries are ``DetectedVibration`` or None
 Progress = Callable[[int, int], None] | None
-BorderName = Literal["mirror", "hold", "crop"]
+BorderName = Literal["mirror", "crop"]
 PixelFormat = Literal["gray8", "gray16le", "rgb24", "bgr24"]  # of raw frames in a pipe
 BadFrames = Literal["pass", "skip"]
 Channels = Literal["first", "last"] | None
@@ -461,8 +461,8 @@ class ProcessVideoOptions(RunOptions, ResourceOptions):
     """Options of ``process_video``; each of its two passes counts as half of the progress."""
 
     border: BorderName = "mirror"
-    """Pixels that the sensor did not record: ``"mirror"``, extrapolated from each frame by itself; ``"hold"``, as in
-    the frame before; ``"crop"``, cut off by constant margins."""
+    """Pixels that the sensor did not record: ``"mirror"``, extrapolated from each frame by itself; ``"crop"``, cut off
+    by constant margins."""
     steady: NotNegative = 0.0
     """Every frame is moved to a smooth path, and its skew and wobble are undone: shaking whose period is this time in s
     or shorter is removed, slower motion is kept. 0: frames stay where they are, and only vibration is removed."""

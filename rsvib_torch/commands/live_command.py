@@ -19,7 +19,7 @@ from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.shared_options import CameraOptions, RangeOptions, check_file, size_of
 from rsvib_torch.commands.terminal import Answer, warn
 from rsvib_torch.files.reading import Table
-from rsvib_torch.options import BorderName, PixelFormat, TrackerOptions, method_options
+from rsvib_torch.options import PixelFormat, TrackerOptions, method_options
 from rsvib_torch.text import number_of
 
 if TYPE_CHECKING:
@@ -52,9 +52,6 @@ class LiveOptions(CameraOptions, RangeOptions):
     ]
     steady: NotNegative = option(0.0, metavar="SECONDS")
     """Stabilise the image to a straight line through the last part of its path (a camera; a file with --realtime)."""
-    border: BorderName = "mirror"
-    """Pixels that the sensor did not record: mirror, extrapolated; hold, as in the frame before; crop is available for
-    videos (rsvib run --video)."""
     waiting: Count = 64
     """Frames that wait before the oldest ones are dropped."""
     num_frames: _AT_LEAST_2 | None = None
@@ -112,7 +109,6 @@ def live_session(given: LiveOptions) -> Answer:
             source,
             tracker,
             outputs,
-            border=video.VideoBorder(given.border),
             drops=drops,
             waiting=given.waiting,
             max_frames=given.num_frames,
@@ -147,10 +143,9 @@ def _check_options(given: LiveOptions) -> None:
         raise ValueError(f"--size goes with frames on standard input (-), not with {given.source}")
     if given.realtime and given.file is None:
         raise ValueError(f"--realtime goes with a file, not with {given.source}: a camera has its own rate")
-    if given.border == "crop" or (given.steady > 0 and given.file is not None and not given.realtime):
-        option = "--border crop" if given.border == "crop" else "--steady of a file"
-        remedy = f"rsvib run FRAMES OUT --video --steady {given.steady:g} --border {given.border}"
-        raise ValueError(f"{option} needs frames that come later; process a video with {remedy}")
+    if given.steady > 0 and given.file is not None and not given.realtime:
+        remedy = f"rsvib run FRAMES OUT --video --steady {given.steady:g}"
+        raise ValueError(f"--steady of a file needs frames that come later; process a video with {remedy}")
 
 
 def _outputs(given: LiveOptions, settings: Config, stream: BinaryIO | None) -> list[video.FrameOutput]:

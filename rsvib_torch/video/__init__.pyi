@@ -1,8 +1,8 @@
 from .frame_outputs import FrameOutput, PipeOutput, VideoOutput
+from .margins import Margins
 from .process_video import process_video
 from .session import LiveReport, run_live
 from .sources import CameraSource, FileSource, FrameSource, PipeSource, TimedFrame
-from .video_border import Margins, VideoBorder
 
 __all__ = [
     "CameraSource",
@@ -14,7 +14,6 @@ __all__ = [
     "PipeOutput",
     "PipeSource",
     "TimedFrame",
-    "VideoBorder",
     "VideoOutput",
     "process_video",
     "run_live",

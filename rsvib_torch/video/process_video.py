@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from rsvib_torch.checks.arrays import PathLike
 from rsvib_torch.checks.validation import fields_of
@@ -46,8 +45,7 @@ _JUDGED_FRAMES = 4  # of each part, two neighbouring ones of which are judged
 _OF_GYROSCOPE = ("orientation", "offset", "offset_std", "scale", "bias", "focal_length", "focal_length_std")
 
 Planes = list[Frame]
-# what was removed from a frame, and ``VideoFrames.restored`` of it; None if it cannot be read
-_Restored = tuple[FrameTrack, Planes | None, list[NDArray[np.bool_]] | None]
+_Restored = tuple[FrameTrack, Planes | None]  # what was removed from a frame, and its planes; None: it cannot be read
 
 
 @file_options(ProcessVideoOptions)
@@ -70,10 +68,10 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
 
     Two frames of each part of 32 are judged. Of a part that is worse, or that path and tones do not explain, and that
     shakes more than as taken, rows are not moved apart: no vibration, and with ``steady`` no wobble, is undone; if it
-    shakes less, it has no verdict. Frames that cannot be decoded and constant frames are replaced by the frame before;
-    copies of the frame before are moved along the smooth path. The video is encoded in parts in the folder
-    ``.NAME.rsvib`` beside it, from which an interrupted run is resumed. A video whose corners shake more in the
-    restored frames than in those of the input is not written.
+    shakes less, it has no verdict. Frames that cannot be decoded and constant frames are replaced by the frame before
+    (at the beginning of a part by the one behind them); copies of the frame before are moved along the smooth path. The
+    video is encoded in parts in the folder ``.NAME.rsvib`` beside it, from which an interrupted run is resumed. A video
+    whose corners shake more in the restored frames than in those of the input is not written.
 
     Args:
         source: A video, or another stack as in ``read_stack``.
@@ -152,7 +150,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
 
     def write(folder: RunFolder) -> None:
         with whole_file(sink) as part:
-            join_parts(part, content, (folder.open(name) for name in folder.files() if not name.endswith(".npy")))
+            join_parts(part, content, map(folder.open, folder.files()))
 
     return run_to_file(
         sink,
@@ -197,7 +195,7 @@ def _planned(
     with closing(open_stack(source)) as reader:
         stored = reader.picture if isinstance(reader, VideoReader) else None
     picture = stored if stored is not None and stored.fits(sink.suffix.lower()) else None
-    frames = VideoFrames(job, picture, masks=options.border != "mirror")
+    frames = VideoFrames(job, picture)
     if job.info.shape[0] < 3:
         raise ValueError(
             f"{source}: to be followed, a video needs at least 3 frames, it has {job.info.shape[0]}; use process_stack "
@@ -262,32 +260,29 @@ class _SecondPass:
                     yield video.left_alone(track) if is_worse else track, frame
 
     def _restored(self, track: FrameTrack, frame: Frame | str) -> _Restored:
-        return (track, None, None) if isinstance(frame, str) else (track, *self.video.frames.restored(frame, track))
+        return track, None if isinstance(frame, str) else self.video.frames.restored(frame, track)
 
     def _encode(self, part: int, frames: Iterator[_Restored]) -> None:
-        """Encode the frames of a part, and enter it in the folder with the frame that it ends with."""
+        """Encode the frames of a part, and enter it in the folder."""
         layout, folder = self.video.frames, self.folder
         name = f"{part:06d}{folder.sink.suffix.lower()}"
         tracks: list[FrameTrack] = []
-        before: Planes | None = None  # the frame before, without margins cut off
-        if part > 0:
-            with folder.open(f"{part - 1:06d}.npy") as file:
-                before = layout.planes(np.load(file, allow_pickle=False))
+        shown: Frame | None = None  # the last frame that could be used
         with part_of_video(folder.create(name), folder.sink, self.info, layout.picture) as write:
-            for track, planes, visible in frames:
+            for track, planes in frames:
                 if tracks:
                     self.progress()  # the frame before is complete
-                if planes is None or (track.fault is not None and before is not None):
-                    before = layout.black() if before is None else before
-                elif visible is None or before is None:  # nothing is hidden, or it is mirrored
-                    before = planes
-                else:  # hidden pixels are held
-                    before = [np.where(*one) for one in zip(visible, planes, before, strict=True)]
-                write(layout.frame(_cut(before, self.margins)))
+                if planes is not None and track.fault is None:
+                    is_first, shown = shown is None, layout.frame(_cut(planes, self.margins))
+                    for _ in range(len(tracks) if is_first else 0):  # those before it could not be used
+                        write(shown)
+                if shown is not None:
+                    write(shown)
                 tracks.append(track)
-        assert before is not None
-        record = self.video.record(part, tracks, self.motion, self.verdicts[part])
-        folder.add(record, [name], np.ascontiguousarray(layout.frame(before)))
+            if shown is None:
+                for _ in tracks:
+                    write(layout.frame(_cut(layout.black(), self.margins)))
+        folder.add(self.video.record(part, tracks, self.motion, self.verdicts[part]), [name])
         self.progress()
 
 

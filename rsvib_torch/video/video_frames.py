@@ -1,4 +1,4 @@
-"""Restoration of one frame of a video: its planes, the pixels that the sensor did not record, and margins.
+"""Restoration of one frame of a video: its planes, and margins.
 
 Invariant: the displacement depends on the row only (docs/architecture.md); with roll and zoom also linearly on the
 column.
@@ -57,7 +57,6 @@ class VideoFrames:
 
     job: StackJob  # source and settings
     picture: Picture | None  # if frames are the planes Y, U and V of a 4:2:0 video (``VideoReader.planes``)
-    masks: bool  # whether to determine which pixels the sensor recorded
 
     @property
     def planar(self) -> bool:
@@ -112,16 +111,12 @@ class VideoFrames:
             return margins
         return Margins(*(side + side % 2 for side in (margins.top, margins.bottom, margins.left, margins.right)))
 
-    def restored(self, frame: Frame, track: FrameTrack) -> tuple[list[Frame], list[NDArray[np.bool_]] | None]:
-        """Planes of a restored frame, as taken if it could not be used, and of each the pixels (H, W) that are visible.
-
-        These are those that the sensor recorded; None: all, or they were not determined.
-        """
+    def restored(self, frame: Frame, track: FrameTrack) -> list[Frame]:
+        """Planes of a restored frame, as taken if it could not be used."""
         planes, method = self.planes(frame), self.job.chosen.method
         if track.fault is not None or not bool(track.motion.moving_axes().any()):
-            return planes, None
+            return planes
         results: list[Frame] = []
-        visible: list[NDArray[np.bool_]] = []
         for number, plane in enumerate(planes):
             motion = track.motion if number == 0 else _on_half_pixels(track.motion)
             timing = self.timing_of(number, track.exposure)
@@ -135,17 +130,12 @@ class VideoFrames:
                     values[:2] = 0.0
                 motion = replace(motion, amplitude=torch.zeros_like(motion.amplitude), **rest)
             offsets, weights = recorded_offsets(motion, timing, plane.shape[-2:])
-            is_rowwise = len(weights) == 1  # all columns are displaced alike
-            if self.masks or not is_rowwise:
-                source = places(offsets, weights, timing, plane.shape[-2:])
-            if is_rowwise:
+            if len(weights) == 1:  # all columns are displaced alike
                 results.append(_with_rows_moved(plane, offsets[..., 0], rows_first=timing.scan_axis == -2))
             else:
+                source = places(offsets, weights, timing, plane.shape[-2:])
                 results.append(_with_pixels_moved(plane, source, _KERNELS[number]))
-            if self.masks:
-                limits = np.array(plane.shape[:-3:-1], dtype=np.float32)[:, None, None] - 1
-                visible.append(np.all((source >= 0) & (source <= limits), axis=0))
-        return results, visible if self.masks else None
+        return results
 
     def timing_of(self, plane: int, exposure: float | None = None) -> SensorTiming:
         """Timing of one frame, with the time origin in its middle; rows of chroma lie between two of luma."""

@@ -140,7 +140,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     pool |= {"count": 2, "shape": (3, 96, 64), "dtype": "float32", "frame": frames[0].numpy(), "x": scene}
     pool |= {"y": frames[0], "scene_shape": (160, 128), "tones": None, "flicker_frequency": 1000.0}
     pool |= {"results": [detected.std] * 2, "images": frames}
-    pool |= {"visible": torch.ones(96, 64, dtype=torch.bool), "other": rsv.Margins(1, 2, 3, 4), "place": torch.zeros(2)}
+    pool |= {"place": torch.zeros(2)}
     pool |= {"stated": timing, "agreeing": timing, "row_time": 1e-4, "pixel_size": 5e-6}
     pool |= {"exposure_times": [1e-3, 2.5e-4], "frame_rate": 30.0, "detections": [detected], "source": stack}
 
@@ -210,7 +210,6 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
         "Vibration": call(rsv.Vibration, amplitude=[1.2, 0.8], frequency=[130.0, 170.0], image_motion=(5.0, 3.0)),
         "VibrationDetector": call(rsv.VibrationDetector, **fast),
         "VibrationRestorer": call(rsv.VibrationRestorer, joint=False),
-        "VideoBorder": call(rsv.VideoBorder),
         "VibrationTracker": call(rsv.VibrationTracker, timing=rsv.SensorTiming(1e-4, 6, 104)),
         "VibrationCorrector": call(rsv.VibrationCorrector, detection=fast, restoration={"method": "dewarp"}),
     }

@@ -283,8 +283,6 @@ def test_pixels_beyond_all_scales(value):
         (lambda: flicker(FRAMES[:1], on_fraction=0.5, light_contrast=0.5), "not both"),
         (lambda: flicker(FRAMES[:1], 30.0, frame_rate=29.97), "slower than a frame"),
         (lambda: flicker(torch.full((1, 64, 64), 900, dtype=torch.int16)), "full_scale"),
-        (lambda: rsv.VideoBorder("zoom"), "border must be 'mirror'"),
-        (lambda: rsv.VideoBorder("crop"), "margins go with border='crop' and only with it"),
         (lambda: rsv.Margins(4, 4, 0, 0).cut(torch.zeros(8, 8)), "leave nothing of frames of 8 x 8 px"),
         (lambda: Reason("unknown"), "code must be one of"),
         (lambda: Reason("tone_blind", value=0.05, limit=0.1), "do not fit its text"),

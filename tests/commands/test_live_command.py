@@ -57,7 +57,7 @@ def test_from_pipe_to_pipe(clip, monkeypatch, capfdbinary):
 
 
 def test_a_file_at_its_own_rate(clip, capsys):
-    assert rsvib("live", clip, *CAMERA[:4], "--realtime", "--border", "hold", "--steady", 0.2) == 0
+    assert rsvib("live", clip, *CAMERA[:4], "--realtime", "--steady", 0.2) == 0
     shown = capsys.readouterr()
     assert "per second, from the times in" in shown.out  # the frame rate of the file
     assert "delay: " in shown.out
@@ -72,8 +72,7 @@ def test_a_file_at_its_own_rate(clip, capsys):
         (("none.mp4",), "none.mp4: no such file; a camera is a number or a URL"),
         (("CLIP", "--out", "still.gif"), "a live video is written to .mp4, .mov, .m4v or .mkv"),
         (("CLIP", "--out", "CLIP", "--overwrite"), "it is the input"),
-        (("CLIP", "--steady", "1"), "rsvib run FRAMES OUT --video --steady 1 --border mirror"),
-        (("0", "--border", "crop"), "--border crop needs frames that come later"),
+        (("CLIP", "--steady", "1"), "rsvib run FRAMES OUT --video --steady 1"),
     ],
 )
 def test_wrong_options_are_refused_in_one_line(clip, arguments, message, capsys, tmp_path, monkeypatch):

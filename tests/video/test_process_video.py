@@ -170,7 +170,7 @@ class _StoppedError(KeyboardInterrupt):
     """Ctrl-C at a chosen frame."""
 
 
-STEADY = {"border": "hold", "steady": 0.2, **OPTIONS}
+STEADY = {"border": "crop", "steady": 0.2, **OPTIONS}
 
 
 @pytest.fixture(scope="module", name="whole")
