@@ -93,7 +93,6 @@ from .stacks import VibrationCorrector as VibrationCorrector
 from .stacks import iterate_stack as iterate_stack
 from .stacks import process_stack as process_stack
 from .stacks import read_manifest as read_manifest
-from .stacks import restore_block as restore_block
 from .tracking import TrackedFrame as TrackedFrame
 from .tracking import VibrationTracker as VibrationTracker
 from .tracking import follow_vibration as follow_vibration

@@ -2,7 +2,6 @@ from .corrector import CorrectedFrames as CorrectedFrames
 from .corrector import VibrationCorrector as VibrationCorrector
 from .job import WindowResult as WindowResult
 from .job import options_of_windows as options_of_windows
-from .job import restore_block as restore_block
 from .manifest import StackManifest as StackManifest
 from .manifest import read_manifest as read_manifest
 from .memory import check_stack_fits as check_stack_fits

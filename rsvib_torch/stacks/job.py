@@ -12,8 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks.arguments import checks_arguments
-from rsvib_torch.checks.arrays import Channels, PathLike, channel_axis
+from rsvib_torch.checks.arrays import PathLike
 from rsvib_torch.checks.values import check_choice
 from rsvib_torch.detection import detect_vibration
 from rsvib_torch.files.reading import Table
@@ -372,68 +371,3 @@ def plan_job(
         info, stated.window, memory=options.memory, most=most, restoration=restoration, on_gpu=on_gpu, margin=margin
     )
     return job, windows, at_once
-
-
-@checks_arguments
-def restore_block(
-    frames: Array,
-    timing: SensorTiming,
-    *,
-    detection: OptionTable = None,
-    restoration: OptionTable = None,
-    full_scale: float | None = None,
-    channels: Channels = None,
-    force: bool = False,
-    device: str = "cpu",
-) -> Array:
-    """Detect the vibration in a block of frames and restore them; the result has the shape and data type of the block.
-
-    For ``dask.array.map_overlap`` with an overlap of one frame, and similar tools. The time origin is the first frame
-    of the block. A block in which the detection fails is returned unchanged, as are frames that cannot be used.
-
-    Args:
-        frames: (T, H, W) or (T, C, H, W), as stored.
-        timing: The sensor; frames must be evenly spaced, because the position of the block in the stack is unknown.
-        detection: Options of ``detect_vibration``.
-        restoration: Options of ``restore``, for frames whose full scale is 1; not ``joint=True``.
-        full_scale: Count that corresponds to 1.0; 255 for ``uint8`` if not given, required for other integers.
-        channels: ``"last"`` for frames (T, H, W, C), as in ``detect_vibration``.
-        force: Whether to return restored frames even if they are judged worse than the raw ones.
-        device: Device for the computation.
-
-    Returns:
-        Restored frames.
-
-    Raises:
-        ValueError: If the timing has frame start times, ``joint=True``, the full scale is unknown, or the frames appear
-            to have their channels last.
-
-    Example:
-        >>> restored = array.map_overlap(  # doctest: +SKIP
-        ...     rsv.restore_block, depth={0: 1}, boundary="none", dtype=array.dtype, meta=array._meta,
-        ...     timing=timing, full_scale=4095,
-        ... )
-    """
-    if timing.frame_start_times is not None:
-        raise ValueError(
-            "timing must not have frame_start_times: the position of a block in the stack is unknown; use process_stack"
-        )
-    options = dict(restoration or {})
-    if options.get("joint") is True:
-        raise ValueError("joint=True makes one image of a block; restore_block keeps its shape")
-    for name in ("scale", "mosaic"):
-        if options.get(name) not in (None, 1):
-            raise ValueError(f"{name}={options[name]!r} changes the size of the frames; restore_block keeps it")
-    scales.check_dtype(frames.dtype)
-    axis = channel_axis("frames", frames.shape, channels)
-    stored = np.moveaxis(frames.astype(frames.dtype.newbyteorder("="), copy=False), axis, -3)
-    scale = scales.known_full_scale(frames.dtype, full_scale)
-    if frames.dtype.kind != "f":
-        scale = scales.required_full_scale(scale, frames.dtype, "frames")
-    info = StackInfo(stored.shape, stored.dtype.name, scale)
-    chosen = ProcessStackOptions(
-        detection=detection, restoration=options, full_scale=scale, force=force, device=device, follow=False
-    )
-    job = StackJob(Path("frames"), info, timing, chosen)
-    window, pixels = Window(0, 0, len(stored) - 1, len(stored)), list(stored)
-    return np.moveaxis(np.stack(job.stored(job.compute(window, pixels), pixels)[0]), -3, axis)

@@ -83,7 +83,6 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     path = torch.stack([0.5 * torch.sin(800 * times), 0.3 * torch.cos(700 * times)], -1)
     recorded = rsv.FreeMotion.through(times, path)
     stripes = torch.stack([0.5 + 0.3 * torch.sin(rows[:, :1] * 0.5 + phase).expand(-1, 32) for phase in (0.0, 1.0)])
-    counts = (frames * 4095).round().clamp(0, 4095).numpy().astype(np.uint16)
     stack, motion_file = folder / "frames.npy", folder / "motion.csv"
     rsv.write_stack(stack, frames, dtype="float32")
     video = folder / "frames.mkv"
@@ -173,7 +172,6 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
         "read_manifest": {"path": folder / "out.npy.manifest.json"},
         "read_motion": {"path": motion_file, "unit": "rad", "focal_length": 100.0},
         "read_vibration": {"path": folder / "vibration.json"},
-        "restore_block": {"frames": counts, **options, "full_scale": 4095.0},
         "row_psf": {"starts": timing.row_starts(1, 96)[0], "num_nodes": 4},
         "save_figure": {"path": new["figure.png"], "dpi": 20},
         "simulate_frames": {"frame_size": (64, 48), "num_frames": 2, "generator": generator},

@@ -170,7 +170,6 @@ def test_pixels_beyond_all_scales(value):
         (lambda: rsv.row_psf(VIBRATION, STARTS, TIMING, quadrature="simpson"), "quadrature must be 'midpoint'"),
         (lambda: rsv.row_psf(ROLL, TIMING.row_starts(1, 8), TIMING), "not defined with roll, zoom or a camera"),
         (lambda: rsv.MotionCheck(torch.zeros(3), torch.zeros(2), True, (), *CURVES), r"before must have shape \(2,\)"),
-        (lambda: rsv.restore_block(nested(), TIMING), "frames must be an instance of ndarray, got a nested tensor"),
         (lambda: rsv.detect_motion(FRAMES, TIMING, knot_rows=10**9, **BANDS), "knot_rows must be at most"),
         (
             lambda: rsv.FreeMotion.from_samples(torch.arange(11.0), torch.zeros(11, 2, requires_grad=True)),

@@ -2,16 +2,10 @@
 
 import sys
 
-import dask.array
 import distributed
-import numpy as np
 import pytest
-import tifffile
-from refusals import refuses
-from small_stack import FRAMES, OPTIONS, STILL, TIMING, process_small, stop_after
-from truth import decibel
+from small_stack import FRAMES, process_small, stop_after
 
-import rsvib_torch as rsv
 from rsvib_torch.stacks import engines, read_manifest
 
 
@@ -66,37 +60,3 @@ def test_missing_scheduler_and_missing_package(whole, tmp_path, monkeypatch):
     with pytest.raises(ModuleNotFoundError, match=r"the package distributed: pip install .*\[distributed\]"):
         process_small(whole / "frames.tif", tmp_path / "out.tif", scheduler="local")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_blocks_of_a_dask_array(whole):
-    counts = tifffile.imread(whole / "frames.tif")
-    array = dask.array.from_array(counts, chunks=(6, -1, -1))
-    options = {name: OPTIONS[name] for name in ("detection", "restoration")}
-    restored = array.map_overlap(
-        rsv.restore_block,
-        depth={0: 1},
-        boundary="none",
-        dtype=array.dtype,
-        meta=array._meta,
-        timing=TIMING,
-        full_scale=4095,
-        **options,
-    )
-    frames = restored.compute(scheduler="synchronous")
-    assert (frames.shape, frames.dtype) == (counts.shape, counts.dtype)
-    assert min(decibel(frame / 4095, STILL, 12) for frame in frames) > 34
-    block = counts[5:13]  # as map_overlap passes it
-    np.testing.assert_array_equal(rsv.restore_block(block, TIMING, full_scale=4095, **options)[1:-1], frames[6:12])
-
-
-def test_blocks_that_cannot_be_restored_are_returned_or_refused(whole):
-    counts = tifffile.imread(whole / "frames.tif")[:3]
-    for block in (counts[:1], np.zeros_like(counts)):
-        restored = rsv.restore_block(block, TIMING, full_scale=4095)
-        np.testing.assert_array_equal(restored, block)
-        assert not np.shares_memory(restored, block)
-    with pytest.raises(ValueError, match="joint=True makes one image of a block"):
-        rsv.restore_block(counts, TIMING, full_scale=4095, restoration={"joint": True})
-    uneven = rsv.SensorTiming(1e-4, 6, 104, frame_start_times=[0.0, 0.1, 0.3])
-    refuses(lambda: rsv.restore_block(counts, uneven, full_scale=4095), "must not have frame_start_times")
-    refuses(lambda: rsv.restore_block(counts, TIMING), "full scale of uint16 frames unknown")
