@@ -390,10 +390,9 @@ class ResourceOptions:
     """As in ``read_stack``."""
     memory: str | float | None = None
     """Limit for the memory of the process, in bytes or like ``"2GB"``; by default three quarters of the memory that is
-    free or used by the process. It does not limit Dask workers."""
+    free or used by the process."""
     workers: Annotated[int, Field(ge=1)] | None = None
-    """Largest number of windows, or of frames of a video, to compute at once; by default the number of processors. Of
-    local Dask workers, the number of processes."""
+    """Largest number of windows, or of frames of a video, to compute at once; by default the number of processors."""
     device: str = "auto"
     """``"auto"``, ``"cpu"`` or ``"cuda"``."""
 
@@ -449,9 +448,6 @@ class ProcessStackOptions(RunOptions, WindowOptions, StackOptions):
     motion: object = None
     """A ``FreeMotion`` of all frames to use instead of detections, such as a recorded one (``align_motion``): in image
     axes, with the exposure start of the first row of frame 0 as time origin. Frames are restored to its place 0."""
-    scheduler: str | None = None
-    """Address of a Dask scheduler whose workers can read ``source`` under the same path; ``"local"`` starts workers on
-    this machine; None computes in this process."""
     compression: str | None = None
     """Compression of a TIFF stack, zlib or lzma, as in ``write_stack``."""
 

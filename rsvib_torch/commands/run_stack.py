@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 _RESULTS = (*answers.OF_DETECTION, *answers.OF_WINDOWS, "restoration.json", "before_after.png")
-_PROCESSING = ("resume", "compression", "memory", "workers", "scheduler")
+_PROCESSING = ("resume", "compression", "memory", "workers")
 
 
 @options
@@ -156,7 +156,7 @@ def _run_followed(given: RunOptions, restored: Path, common: Table) -> Answer:
     """Process a video from frame to frame."""
     settings, frames, out, restoration = given.settings, given.stack, given.out, common["restoration"]
     changed = [name for name, value in given.windows.items() if value not in (False, "pass")]
-    changed += [name for name in ("scheduler", "compression") if name in given.processing]
+    changed += ["compression"] if "compression" in given.processing else []
     changed += ["optics_sigma" if name == "optics" else name for name in stacks.options_of_windows(restoration)]
     refused = ", ".join(f"--{name.replace('_', '-')}" for name in changed)
     if refused:

@@ -365,8 +365,6 @@ def plan_job(
         most = 1
     else:
         most = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if stated.scheduler not in (None, "local"):  # the memory of other machines is not known
-        return job, windows, most
     at_once = windows_at_once(
         info, stated.window, memory=options.memory, most=most, restoration=restoration, on_gpu=on_gpu, margin=margin
     )

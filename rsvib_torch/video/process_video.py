@@ -28,9 +28,9 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import ProcessVideoOptions, ResourceOptions, StackOptions
 from rsvib_torch.restoration import RestorationVerdict
 from rsvib_torch.results.presentation import plain_values
-from rsvib_torch.stacks.heap import share_one_heap
 from rsvib_torch.stacks.job import plan_job, single_frame_options
 from rsvib_torch.stacks.manifest import fingerprint, manifest_header, rms_shaking
+from rsvib_torch.stacks.memory import share_one_heap
 from rsvib_torch.stacks.run_folder import RunFolder, StackReport, run_to_file
 from rsvib_torch.video import Margins
 from rsvib_torch.video.video_frames import Frame, FrameTrack, VideoFrames

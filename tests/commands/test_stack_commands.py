@@ -147,7 +147,6 @@ def test_bad_frames_are_reported(place, tmp_path, capsys):
         (("--memory", "much"), "memory must be like '2GB' or '500MB', got 'much'"),
         (("--memory", "100MB"), "memory of 100 MB is too little: a window of 4 frames of 96 x 64 px takes about"),
         (("--output", "../restored.tif"), "--output must be a file name without a folder, got '../restored.tif'"),
-        (("--scheduler", "nonsense://x"), "no Dask scheduler answers at nonsense://x"),
     ],
 )
 def test_errors_are_one_line_and_leave_no_files(place, tmp_path, capsys, options, message):
