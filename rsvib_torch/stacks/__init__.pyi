@@ -1,5 +1,3 @@
-from .corrector import CorrectedFrames as CorrectedFrames
-from .corrector import VibrationCorrector as VibrationCorrector
 from .job import WindowResult as WindowResult
 from .job import options_of_windows as options_of_windows
 from .manifest import StackManifest as StackManifest

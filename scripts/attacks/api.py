@@ -209,7 +209,6 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
         "VibrationDetector": call(rsv.VibrationDetector, **fast),
         "VibrationRestorer": call(rsv.VibrationRestorer, joint=False),
         "VibrationTracker": call(rsv.VibrationTracker, timing=rsv.SensorTiming(1e-4, 6, 104)),
-        "VibrationCorrector": call(rsv.VibrationCorrector, detection=fast, restoration={"method": "dewarp"}),
     }
     result |= constructed
     modules = {"VibrationDetector": detector, "VibrationRestorer": restorer, "RollingShutterVibration": augmentation}
