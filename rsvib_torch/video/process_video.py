@@ -26,7 +26,6 @@ from rsvib_torch.io.video import CONTAINERS, VideoReader, join_parts, part_of_vi
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import ProcessVideoOptions, ResourceOptions, StackOptions
-from rsvib_torch.restoration import RestorationVerdict
 from rsvib_torch.results.presentation import plain_values
 from rsvib_torch.stacks.job import plan_job, single_frame_options
 from rsvib_torch.stacks.manifest import fingerprint, manifest_header, rms_shaking
@@ -34,12 +33,9 @@ from rsvib_torch.stacks.memory import share_one_heap
 from rsvib_torch.stacks.run_folder import RunFolder, StackReport, run_to_file
 from rsvib_torch.video import Margins
 from rsvib_torch.video.video_frames import Frame, FrameTrack, VideoFrames
-from rsvib_torch.video.video_passes import PART_FRAMES, VideoMotion, VideoPasses
+from rsvib_torch.video.video_passes import PART_FRAMES, VideoMotion, VideoPasses, shakes_more
 
-# A video that shakes more is refused: wrong settings make it 1.5 to 5 times as shaky. 0.1 px is not visible.
-_MORE_SHAKING, _VISIBLE_SHAKING = 1.1, 0.1  # -, px
-
-_JUDGED_FRAMES = 4  # of each part, two neighbouring ones of which are judged
+_JUDGED_FRAMES = 4  # of each part, whose shaking decides whether it is restored
 
 # What the manifest states of the alignment of a gyroscope.
 _OF_GYROSCOPE = ("orientation", "offset", "offset_std", "scale", "bias", "focal_length", "focal_length_std")
@@ -66,12 +62,11 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
 
     Tones that sweep are followed in windows of 24 frames, where others leave more than 0.3 px.
 
-    Two frames of each part of 32 are judged. Of a part that is worse, or that path and tones do not explain, and that
-    shakes more than as taken, rows are not moved apart: no vibration, and with ``steady`` no wobble, is undone; if it
-    shakes less, it has no verdict. Frames that cannot be decoded and constant frames are replaced by the frame before
-    (at the beginning of a part by the one behind them); copies of the frame before are moved along the smooth path. The
-    video is encoded in parts in the folder ``.NAME.rsvib`` beside it, from which an interrupted run is resumed. A video
-    whose corners shake more in the restored frames than in those of the input is not written.
+    Of a part of 32 frames whose first ones would shake more than as taken, rows are not moved apart: no vibration, and
+    with ``steady`` no wobble, is undone. Frames that cannot be decoded and constant frames are replaced by the frame
+    before (at the beginning of a part by the one behind them); copies of the frame before are moved along the smooth
+    path. The video is encoded in parts in the folder ``.NAME.rsvib`` beside it, from which an interrupted run is
+    resumed. A video whose corners shake more in the restored frames than in those of the input is not written.
 
     Args:
         source: A video, or another stack as in ``read_stack``.
@@ -176,7 +171,7 @@ def _check_shaking(folder: RunFolder, *, is_explained: bool) -> None:
             "shaking of the restored video cannot be measured"
         )
     for key, (before, after) in shaking.items():
-        if after > _MORE_SHAKING * before + _VISIBLE_SHAKING:
+        if shakes_more(before, after):
             folder.remove()
             raise ValueError(
                 f"the restored video would shake more than the input: {after:.2g} px {names[key]}, {before:.2g} px "
@@ -229,7 +224,7 @@ class _SecondPass:
     info: StackInfo  # of the video to write
     margins: Margins | None  # which are cut off
     progress: Callable[[], None]
-    verdicts: dict[int, RestorationVerdict | None] = field(default_factory=dict)  # on the parts
+    worse: set[int] = field(default_factory=set)  # parts that are left alone
 
     def run(self, at_once: int) -> None:
         """Restore a number of frames at the same time."""
@@ -250,14 +245,10 @@ class _SecondPass:
                     continue
                 tracked = ((video.track(motion, index), frame) for index, frame in frames)
                 first = list(islice(tracked, _JUDGED_FRAMES))
-                verdict = video.verdict(motion, first)
-                # Parallax and overlays make two frames worse that shake less: corners decide.
-                contradicts = verdict is not None and verdict.overall == "worse"
-                is_doubted = contradicts or not video.is_explained(motion, part)
-                is_worse = is_doubted and video.shakes_more(motion, [track for track, _ in first])
-                self.verdicts[part] = None if is_doubted and not is_worse else verdict
+                if video.is_worse(motion, part, [track for track, _ in first]):
+                    self.worse.add(part)
                 for track, frame in chain(first, tracked):
-                    yield video.left_alone(track) if is_worse else track, frame
+                    yield video.left_alone(track) if part in self.worse else track, frame
 
     def _restored(self, track: FrameTrack, frame: Frame | str) -> _Restored:
         return track, None if isinstance(frame, str) else self.video.frames.restored(frame, track)
@@ -282,7 +273,7 @@ class _SecondPass:
             if shown is None:
                 for _ in tracks:
                     write(layout.frame(_cut(layout.black(), self.margins)))
-        folder.add(self.video.record(part, tracks, self.motion, self.verdicts[part]), [name])
+        folder.add(self.video.record(part, tracks, self.motion, is_worse=part in self.worse), [name])
         self.progress()
 
 

@@ -73,13 +73,9 @@ class VideoFrames:
         """Count that corresponds to 1.0; None for floats."""
         return self.job.options.full_scale if self.picture is None else 255.0
 
-    def luma(self, frame: Frame) -> Frame:
-        """The part of a frame in which motion is measured."""
-        return frame[: self.size[0]] if self.planar else frame
-
     def grey(self, frame: Frame) -> NDArray[np.uint8]:
         """The frame as 8-bit counts (H, W), in which corners are followed."""
-        luma: Array = self.luma(frame)
+        luma: Array = self.planes(frame)[0]
         luma = luma if luma.ndim == 2 else luma.mean(0)
         if luma.dtype == np.uint8:
             return luma.astype(np.uint8, copy=False)

@@ -214,8 +214,6 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     modules = {"VibrationDetector": detector, "VibrationRestorer": restorer, "RollingShutterVibration": augmentation}
     for name, module in modules.items():
         result[f"{name}.forward"] = call(module.forward)
-    corrector = rsv.VibrationCorrector(timing, detection=fast, restoration={"method": "dewarp"})
-    result["VibrationCorrector.forward"] = Call(corrector.forward, {"frames": frames[None, :, None]})
     result["FixedDewarp.forward"] = Call(rsv.FixedDewarp(timing, vibration, (96, 64), 3).forward, {"frames": frames})
     result["RollingShutterVibration.drawn_vibration"] = call(augmentation.drawn_vibration)
     report = rsv.process_stack(stack, folder / "again.npy", timing, **windows)

@@ -149,15 +149,6 @@ def test_a_steady_video_follows_the_mean_of_its_path(shaky, tmp_path):
     assert min(margins.values()) >= 2
 
 
-def test_parts_of_a_video_are_judged_with_the_motion_of_the_hand_in_both_frames(tmp_path):
-    """Between two frames, this hand leaves the parabola of the first one by 2 px."""
-    clip = write(tmp_path / "clip.mp4", counts_of(shaken(6.0, 6.0)))
-    report = process_video(clip, tmp_path / "steady.mp4", TIMING, border="crop", steady=0.5, **OPTIONS)
-    windows = read_manifest(report.manifest).windows
-    assert [one.outcome for one in windows] == ["helps"] * 2
-    assert min(one.predicted_gain for one in windows) > 6
-
-
 def test_tones_of_a_wrong_row_time_are_not_reliable(clip, tmp_path):
     timing = SensorTiming(row_time=0.73 * 150e-6, exposure_rows=4 / 0.73, frame_rows=1 / RATE / (0.73 * 150e-6))
     report = process_video(f"{clip}[0:20]", tmp_path / "still.mp4", timing, **OPTIONS)
