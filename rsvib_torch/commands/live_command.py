@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, BinaryIO
 from pydantic import Field
 
 from rsvib_torch import io, tracking, video
-from rsvib_torch.checks.validation import Count, NotNegative, options
+from rsvib_torch.checks.validation import NotNegative, options
 from rsvib_torch.commands.answers import detection_data
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.shared_options import CameraOptions, RangeOptions, check_file, size_of
@@ -40,8 +40,6 @@ class LiveOptions(CameraOptions, RangeOptions):
     """Size of the frames on standard input, e.g. 1024x768."""
     pixel_format: PixelFormat = "gray8"
     """Pixels of the frames on standard input."""
-    realtime: bool = False
-    """Read a file at its own rate, and drop frames like a camera."""
     tracker: Annotated[
         Table,
         Given(
@@ -51,9 +49,7 @@ class LiveOptions(CameraOptions, RangeOptions):
         ),
     ]
     steady: NotNegative = option(0.0, metavar="SECONDS")
-    """Stabilise the image to a straight line through the last part of its path (a camera; a file with --realtime)."""
-    waiting: Count = 64
-    """Frames that wait before the oldest ones are dropped."""
+    """Stabilise the image to a straight line through the last part of its path (a camera)."""
     num_frames: _AT_LEAST_2 | None = None
     """Stop after this number of frames."""
 
@@ -94,7 +90,7 @@ def live_session(given: LiveOptions) -> Answer:
     method: str = (settings.restoration | given.tracker).get("method", "dewarp")
     available = set(method_options(method)) - {"joint"}
     restoration = {name: value for name, value in settings.restoration.items() if name in available}
-    drops, source = given.file is None or given.realtime, _source(given, settings)
+    drops, source = given.file is None, _source(given, settings)
     with _frames_on_standard_output(enabled=str(given.out) == "-") as stream:
         outputs = _outputs(given, settings, stream)
         tracker = tracking.VibrationTracker(
@@ -110,7 +106,6 @@ def live_session(given: LiveOptions) -> Answer:
             tracker,
             outputs,
             drops=drops,
-            waiting=given.waiting,
             max_frames=given.num_frames,
         )
     if report.frames == 0:
@@ -132,7 +127,7 @@ def _source(given: LiveOptions, settings: Config) -> video.FrameSource:
         stream = os.fdopen(sys.stdin.fileno(), "rb", closefd=False)
         return video.PipeSource(stream, (height, width), given.pixel_format, settings.timing)
     scale = given.full_scale if given.full_scale is not None else settings.full_scale
-    return video.FileSource(given.file, settings.timing, scale, realtime=given.realtime)
+    return video.FileSource(given.file, settings.timing, scale)
 
 
 def _check_options(given: LiveOptions) -> None:
@@ -141,9 +136,7 @@ def _check_options(given: LiveOptions) -> None:
         raise ValueError("--size WIDTHxHEIGHT is required for raw frames on standard input")
     if given.source != "-" and given.size is not None:
         raise ValueError(f"--size goes with frames on standard input (-), not with {given.source}")
-    if given.realtime and given.file is None:
-        raise ValueError(f"--realtime goes with a file, not with {given.source}: a camera has its own rate")
-    if given.steady > 0 and given.file is not None and not given.realtime:
+    if given.steady > 0 and given.file is not None:
         remedy = f"rsvib run FRAMES OUT --video --steady {given.steady:g}"
         raise ValueError(f"--steady of a file needs frames that come later; process a video with {remedy}")
 

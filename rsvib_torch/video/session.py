@@ -59,7 +59,6 @@ def run_live(
     outputs: Sequence[FrameOutput],
     *,
     drops: bool = True,
-    waiting: int = 64,
     max_frames: int | None = None,
     progress: Callable[[TrackedFrame, LiveReport], None] | None = None,
 ) -> LiveReport:
@@ -73,8 +72,7 @@ def run_live(
         outputs: They get frames of 8 bits, (H, W) or (H, W, 3), and are closed at the end. The session ends if the
             program behind a pipe does.
         drops: Whether the source must not wait. If processing is too slow, the motion of late frames is then predicted
-            instead of measured, and beyond ``waiting`` frames the oldest are dropped.
-        waiting: Largest number of frames that wait.
+            instead of measured, and beyond 64 waiting frames the oldest are dropped.
         max_frames: Number of frames to process; None for all.
         progress: Called for every tracked frame.
 
@@ -87,7 +85,7 @@ def run_live(
     """
     report, begin, threads = LiveReport(), time.perf_counter(), torch.get_num_threads()
     period = tracker.timing.frame_period
-    reader, last, index = FrameReader(source, waiting, drops=drops), None, -1
+    reader, last, index = FrameReader(source, drops=drops), None, -1
 
     with ExitStack() as ending:  # from the last line to the first
         ending.callback(torch.set_num_threads, threads)

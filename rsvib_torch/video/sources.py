@@ -144,27 +144,21 @@ class PipeSource:
 class FileSource:
     """A file, as ``open_stack`` reads it, with its frame times.
 
-    Frames come as fast as they are processed, or with ``realtime`` at the times of the file. ``full_scale`` is the
-    count that means 1.0, if the file does not state it.
+    Frames come as fast as they are processed. ``full_scale`` is the count that means 1.0, if the file does not state
+    it.
     """
 
-    def __init__(
-        self, path: Path, timing: SensorTiming, full_scale: float | None = None, *, realtime: bool = False
-    ) -> None:
+    def __init__(self, path: Path, timing: SensorTiming, full_scale: float | None = None) -> None:
         info = read_stack_info(path)
         self._starts = timing_from_first_frame(timing, info).frame_starts(info.shape[0]).tolist()
-        self._path, self._realtime, self.lost = path, realtime, 0
+        self._path, self.lost = path, 0
         self.full_scale = (full_scale or info.full_scale) if info.is_integer else None
 
     def frames(self) -> Iterator[TimedFrame]:
         """The frames of the file."""
         with closing(open_stack(self._path)) as reader:
-            begin = time.perf_counter()
             for index, start in enumerate(self._starts):
-                pixels = reader.frame(index)
-                if self._realtime and (wait := begin + start - self._starts[0] - time.perf_counter()) > 0:
-                    time.sleep(wait)
-                yield TimedFrame(pixels, start - self._starts[0], time.perf_counter())
+                yield TimedFrame(reader.frame(index), start - self._starts[0], time.perf_counter())
 
 
 def _channels_first(pixels: Array) -> Array:

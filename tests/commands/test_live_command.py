@@ -56,18 +56,10 @@ def test_from_pipe_to_pipe(clip, monkeypatch, capfdbinary):
     assert f"{COUNT} frames in".encode() in shown.err
 
 
-def test_a_file_at_its_own_rate(clip, capsys):
-    assert rsvib("live", clip, *CAMERA[:4], "--realtime", "--steady", 0.2) == 0
-    shown = capsys.readouterr()
-    assert "per second, from the times in" in shown.out  # the frame rate of the file
-    assert "delay: " in shown.out
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (("-",), "--size WIDTHxHEIGHT is required for raw frames on standard input"),
-        (("0", "--realtime"), "--realtime goes with a file, not with 0"),
         (("0", "--frames", "5:9"), "--frames goes with a file, not with 0; --num-frames ends a session"),
         (("none.mp4",), "none.mp4: no such file; a camera is a number or a URL"),
         (("CLIP", "--out", "still.gif"), "a live video is written to .mp4, .mov, .m4v or .mkv"),
