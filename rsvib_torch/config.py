@@ -26,7 +26,7 @@ class Config:
     detection: Table  # options of ``detect_vibration`` that are in the file
     restoration: Table  # options of ``restore`` that are in the file
     simulation: "imaging.SimulationSection | None"  # ``[simulation]``, if it is in the file
-    stack: Table  # options ``window``, ``follow`` and ``bad_frames`` of ``process_stack`` that are in the file
+    stack: Table  # options ``window`` and ``follow`` of ``process_stack`` that are in the file
     # options of the program that describe the camera, for the commands that it suggests
     arguments: tuple[str, ...] = ()
     path: Path | None = None  # the file; None if the camera is described by options only
@@ -63,7 +63,7 @@ def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, obj
     * ``[restoration]``: options of ``restore``, with ``saturation`` in the unit of the frames' file.
     * ``[simulation]``: ``num_frames``, ``frame_size``, ``seed``, ``[simulation.vibration]`` (fields of ``Vibration``)
       and ``[simulation.noise]`` (fields of ``SensorNoise``).
-    * ``[stack]``: ``window``, ``follow`` and ``bad_frames`` of ``process_stack``.
+    * ``[stack]``: ``window`` and ``follow`` of ``process_stack``.
 
     Args:
         path: The TOML file; None if ``sensor`` describes the camera.

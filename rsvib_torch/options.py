@@ -41,7 +41,6 @@ Detections = Sequence[Any] | None  # entries are ``DetectedVibration`` or None
 Progress = Callable[[int, int], None] | None
 BorderName = Literal["mirror", "crop"]
 PixelFormat = Literal["gray8", "gray16le", "rgb24", "bgr24"]  # of raw frames in a pipe
-BadFrames = Literal["pass", "skip"]
 Channels = Literal["first", "last"] | None
 DetectionMethod = Literal["direct", "bands"]
 ExportFormat = Literal["gcsv", "csv"]
@@ -362,7 +361,7 @@ class TrackerOptions(RestorationOptions, InputOptions):
 
 
 @options
-class WindowSize:
+class WindowOptions:
     """The windows that a stack is cut into."""
 
     window: Frames = Field(default=8, json_schema_extra=COMMAND_LINE)
@@ -371,15 +370,6 @@ class WindowSize:
     """Follow the vibration from frame to frame in all windows (true) or none (false); by default where it changes, e.g.
     decays (``"auto"``). These are windows in which no steady vibration explains the frames, if more axes are reliable
     then; none with options of detection, ``joint``, ``scale``, ``mosaic`` or ``optics``."""
-
-
-@options
-class WindowOptions(WindowSize):
-    """Processing of stacks in windows."""
-
-    bad_frames: BadFrames = Field(default="pass", json_schema_extra=COMMAND_LINE)
-    """Frames that cannot be read or used: ``"pass"`` writes them unchanged (a frame that cannot be read as NaN, or 0
-    for integers), ``"skip"`` leaves them out."""
 
 
 @options
@@ -398,7 +388,7 @@ class ResourceOptions:
 
 
 @options
-class StackDetectionOptions(WindowSize, ResourceOptions):
+class StackDetectionOptions(WindowOptions, ResourceOptions):
     """Detection in windows."""
 
     detection: OptionTable = None
@@ -440,7 +430,7 @@ class RunOptions(ProgressOptions):
 
 
 @options
-class ProcessStackOptions(RunOptions, WindowOptions, StackOptions):
+class ProcessStackOptions(RunOptions, StackOptions):
     """Options of ``process_stack``."""
 
     given: Detections = None

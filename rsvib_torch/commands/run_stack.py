@@ -101,7 +101,7 @@ def _run_windows(given: RunOptions, restored: Path, info: io.StackInfo, common: 
     common["detection"] = None if chosen.follow is True else settings.detection  # a tracker has none
     resources = {name: value for name, value in given.processing.items() if name in ("memory", "workers")}
     counts = info.shape[0] > chosen.window
-    of_run = common | given.processing | {"bad_frames": chosen.bad_frames, "manifest": out / "manifest.json"}
+    of_run = common | given.processing | {"manifest": out / "manifest.json"}
     with working(f"restoring {frames.name}", counts=counts) as progress:
         of_run["progress"] = progress if counts else None
         result = stacks.process_stack(frames, restored, settings.timing, **of_run)
@@ -155,7 +155,7 @@ def _comparison(given: RunOptions, common: Table, first: stacks.WindowResult) ->
 def _run_followed(given: RunOptions, restored: Path, common: Table) -> Answer:
     """Process a video from frame to frame."""
     settings, frames, out, restoration = given.settings, given.stack, given.out, common["restoration"]
-    changed = [name for name, value in given.windows.items() if value not in (False, "pass")]
+    changed = [name for name, value in given.windows.items() if value is not False]
     changed += ["compression"] if "compression" in given.processing else []
     changed += ["optics_sigma" if name == "optics" else name for name in stacks.options_of_windows(restoration)]
     refused = ", ".join(f"--{name.replace('_', '-')}" for name in changed)

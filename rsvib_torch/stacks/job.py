@@ -218,7 +218,7 @@ class StackJob:
     def stored(self, result: WindowResult, pixels: WindowFrames) -> StoredWindow:
         """The frames of a result as they are stored: frames that were not restored are unchanged.
 
-        A frame that cannot be read is stored as NaN, or 0 for integers, unless bad frames are omitted.
+        A frame that cannot be read is stored as NaN, or 0 for integers.
         """
         dtype = np.dtype(self.info.dtype)
 
@@ -233,7 +233,7 @@ class StackJob:
         for index in [written[len(written) // 2]] if self.chosen.joint is True else written:
             if index in restored:
                 frames.append(counts(restored[index]))
-            elif self.options.bad_frames == "pass" or index not in result.bad_frames:
+            else:
                 frame = pixels[index - result.window.frames.start]
                 if isinstance(frame, str):
                     frame = np.full(self.info.shape[1:], np.nan if dtype.kind == "f" else 0, dtype)

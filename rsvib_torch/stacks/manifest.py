@@ -319,7 +319,7 @@ def fingerprint(path: Path) -> Table:
 
 
 # options on which the result depends
-_SETTINGS = ("full_scale", "window", "follow", "detection", "restoration", "bad_frames", "force", "device")
+_SETTINGS = ("full_scale", "window", "follow", "detection", "restoration", "force", "device")
 
 
 def manifest_header(job: StackJob, output: str | None, compression: str | None) -> Table:

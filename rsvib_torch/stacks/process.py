@@ -140,7 +140,6 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
         return job.stored(result, pixels)
 
     def compute(folder: RunFolder) -> Table:
-        nonlocal out
         remaining = [window for window in windows if window.index not in folder]
         count = len(remaining) if joined else sum(window.kept for window in remaining)
         # the finished windows and the output are on the disk together, until the output is complete
@@ -151,7 +150,6 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
         for frames, record in _watched(results, windows, remaining, errors, options.progress, folder.remove):
             # channels may be stored last
             folder.add(record, array=np.ascontiguousarray(np.stack(frames)) if frames else None)
-        out = out.with_frames(sum(record.written for record in folder.records()))
         return {"not_kept": metadata_not_kept(job.info, sink, out.shape)}
 
     def stored(folder: RunFolder) -> Iterator[Array]:

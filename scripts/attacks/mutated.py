@@ -53,7 +53,6 @@ read_noise = 0.003
 
 [stack]
 window = 4
-bad_frames = "skip"
 """
 )
 _TOKENS = (*b'-1 0 99999999999999999999 1e999 nan null [] {} "" true \xff'.split(), b"[" * 60)
