@@ -1,7 +1,7 @@
 """The computation of one window: reading its frames, detection, restoration, and the record of the result."""
 
 import os
-from collections.abc import Callable, Generator, Iterable, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -133,87 +133,85 @@ class StackJob:
 
     def compute(self, window: Window, pixels: WindowFrames) -> WindowResult:
         """Detect the vibration in a window, restore its frames and judge the result."""
+        # 1. The frames that can be used, of the window and around it.
         options, read = self.options, dict(zip(window.frames, pixels, strict=True))
         found = ((index, frame_fault(read[index], index, options.full_scale, self.info.nodata)) for index in read)
         faults = {index: fault for index, fault in found if fault is not None}
         usable = {index: one for index, one in read.items() if index not in faults and not isinstance(one, str)}
-        inside = {index: frame for index, frame in usable.items() if window.first <= index <= window.last}
-        frames = self._images(inside)
-        kept = tuple(index for index in usable if index in window.written)
+        inside = [index for index in usable if window.first <= index <= window.last]
+        kept = tuple(index for index in inside if index in window.written)
+        taken, timing = self._images([usable[index] for index in inside]), window_timing(self.timing, window, inside)
         bad = {index: fault for index, fault in faults.items() if index in window.written}
-        as_taken = WindowResult(window, kept, self._unchanged(frames[: len(kept)]), None, None, None, bad)
+        result = WindowResult(window, kept, self._unchanged(taken[: len(kept)]), None, None, None, bad)
         if faults and len(inside) < 2:
-            return replace(as_taken, error=next(iter(faults.values())))
-        if options.follow is True:
-            return self._followed(as_taken, usable)
-        timing = window_timing(self.timing, window, list(inside))
+            return replace(result, error=next(iter(faults.values())))
         try:
-            if self.given is None:
-                motion: DetectedVibration | FreeMotion | None
-                motion = detected = detect_vibration(frames, timing, **options.detection or {})
-                as_taken = replace(as_taken, detection=detected)
-                if options.follow == "auto" and may_change(detected, len(usable)):
-                    followed = self._followed(as_taken, usable)
-                    if isinstance(followed.detection, FollowedVibration):
-                        reliable = followed.detection.reliable.double().mean(0).sum()
-                        if reliable > detected.reliable.sum():
-                            return followed
+            # 2. Their motion.
+            motion = self._motion(window, usable, taken, timing)
+            if motion is None:
+                return replace(result, error="no detection was given for this window")
+            if isinstance(motion, DetectedVibration):
+                result = replace(result, detection=motion)
+            if options.restoration is None:
+                return result
+            # 3. The frames without it.
+            if isinstance(motion, FollowedVibration):
+                taken, timing = taken[: len(kept)], window_timing(self.timing, window, list(kept))
+                restoration = restore_followed(taken, timing, motion, self.chosen, force=options.force)
             else:
-                motion = self.given[window.index]
-                missing = "no detection was given for this window" if motion is None else None
-                detection = motion if isinstance(motion, DetectedVibration) else None
-                as_taken = replace(as_taken, detection=detection, error=missing)
-            if motion is None or options.restoration is None:
-                return as_taken
-            restoration = restore_trusted(
-                frames,
-                timing,
-                motion,
-                self.chosen,
-                force=options.force,
-                first_frames=len(kept) if len(kept) > 1 and not self.chosen.joint else None,
-                most_pairs=8 if window.alone else 2,  # limits the time of the verdict
-            )
+                restoration = restore_trusted(
+                    taken,
+                    timing,
+                    motion,
+                    self.chosen,
+                    force=options.force,
+                    first_frames=len(kept) if len(kept) > 1 and not self.chosen.joint else None,
+                    most_pairs=8 if window.alone else 2,  # limits the time of the verdict
+                )
         except (ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
-            return replace(as_taken, error=" ".join(str(error).split()))
-        if self.chosen.joint is True and restoration.restored:  # one image of all frames
-            as_taken, kept = replace(as_taken, indices=()), tuple(inside)
-        return self._restored(as_taken, frames[: len(kept)], restoration)
-
-    def _restored(self, as_taken: WindowResult, taken: Tensor, restoration: RestoredFrames) -> WindowResult:
-        """The result of a window whose frames were restored, from those frames as taken."""
+            return replace(result, error=" ".join(str(error).split()))
+        result = replace(result, restoration=restoration)
         if not restoration.restored:
-            return replace(as_taken, restoration=restoration)
-        frames = restoration.frames if not as_taken.indices else restoration.frames[: len(as_taken.indices)]
-        frames = frames if self.info.nodata is None else without_data(frames, taken)
-        return replace(as_taken, restoration=restoration, frames=frames)
+            return result
+        # 4. Those that are written, or one image of all.
+        if self.chosen.joint is True:
+            result, frames = replace(result, indices=()), restoration.frames
+        else:
+            taken, frames = taken[: len(kept)], restoration.frames[: len(kept)]
+        return replace(result, frames=frames if self.info.nodata is None else without_data(frames, taken))
 
-    def _images(self, frames: Mapping[int, Array]) -> Tensor:
+    def _motion(
+        self, window: Window, usable: Mapping[int, Array], taken: Tensor, timing: SensorTiming
+    ) -> DetectedVibration | FreeMotion | None:
+        """The motion in the frames ``taken`` of a window, or at each that it writes; None if it should be given."""
+        if self.given is not None:
+            return self.given[window.index]
+        detected = None
+        if self.options.follow is not True:
+            detected = detect_vibration(taken, timing, **self.options.detection or {})
+            if self.options.follow is False or not may_change(detected, len(usable)):
+                return detected
+        try:
+            around = window_timing(self.timing, window, list(usable))
+            found = follow_vibration(self._images(list(usable.values())), around, channels="first")
+        except (ValueError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
+            if detected is None:
+                raise
+            return detected
+        written = [found[number] for number, index in enumerate(usable) if index in window.written]
+        followed = FollowedVibration.stacked(written)
+        if detected is None or followed.reliable.double().mean(0).sum() > detected.reliable.sum():
+            return followed
+        return detected
+
+    def _images(self, frames: Sequence[Array]) -> Tensor:
         """Frames as stored as (T, H, W) or (T, C, H, W), full scale 1."""
         if not frames:
             return torch.empty((0, *self.info.shape[1:]), dtype=torch.float32, device="cpu")
-        return self._as_taken(np.stack(list(frames.values()))).to(self.options.device)
+        return self._as_taken(np.stack(frames)).to(self.options.device)
 
     def _as_taken(self, stored: Array) -> Tensor:
         return counts_to_frames(stored, self.options.full_scale, str(self.source), self.info.nodata)
-
-    def _followed(self, as_taken: WindowResult, usable: Mapping[int, Array]) -> WindowResult:
-        """The result of a window whose vibration is followed, from its usable frames and those around it."""
-        window, kept = as_taken.window, list(as_taken.indices)
-        if not kept:
-            return as_taken
-        try:
-            timing = window_timing(self.timing, window, list(usable))
-            found = follow_vibration(self._images(usable), timing, channels="first")
-            followed = FollowedVibration.stacked([found[number] for number, i in enumerate(usable) if i in kept])
-            as_followed, options = replace(as_taken, detection=followed), self.options
-            if options.restoration is None:
-                return as_followed
-            frames, timing = as_taken.frames, window_timing(self.timing, window, kept)
-            restoration = restore_followed(frames, timing, followed, self.chosen, force=options.force)
-        except (ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
-            return replace(as_taken, error=" ".join(str(error).split()))
-        return self._restored(as_followed, frames, restoration)
 
     def stored(self, result: WindowResult, pixels: WindowFrames) -> StoredWindow:
         """The frames of a result as they are stored: frames that were not restored are unchanged.
@@ -225,21 +223,20 @@ class StackJob:
         def counts(images: Tensor) -> Array:
             return scales.frames_to_counts(images, dtype, self.options.full_scale, self.info.nodata)
 
-        if result.restored and not result.indices:
+        def as_taken(index: int) -> Array:
+            frame = pixels[index - result.window.frames.start]
+            if isinstance(frame, str):
+                frame = np.full(self.info.shape[1:], np.nan if dtype.kind == "f" else 0, dtype)
+            if self.chosen.scale == 1 and self.chosen.mosaic is None:
+                return frame
+            return counts(self._unchanged(self._as_taken(frame[None]))[0])  # the shape of restored ones
+
+        if result.restored and not result.indices:  # one image of all frames
             frames = list(counts(result.frames))
-            return frames, self.record(result, len(frames))
-        written = list(result.window.written)
-        restored, frames = result.changed, []
-        for index in [written[len(written) // 2]] if self.chosen.joint is True else written:
-            if index in restored:
-                frames.append(counts(restored[index]))
-            else:
-                frame = pixels[index - result.window.frames.start]
-                if isinstance(frame, str):
-                    frame = np.full(self.info.shape[1:], np.nan if dtype.kind == "f" else 0, dtype)
-                if self.chosen.scale != 1 or self.chosen.mosaic is not None:  # the shape of restored ones
-                    frame = counts(self._unchanged(self._as_taken(frame[None]))[0])
-                frames.append(frame)
+        else:
+            restored, written = result.changed, list(result.window.written)
+            written = [written[len(written) // 2]] if self.chosen.joint is True else written
+            frames = [counts(restored[index]) if index in restored else as_taken(index) for index in written]
         return frames, self.record(result, len(frames))
 
     def record(self, result: WindowResult, written: int) -> WindowRecord:
