@@ -95,7 +95,6 @@ from .stacks import read_manifest as read_manifest
 from .tracking import TrackedFrame as TrackedFrame
 from .tracking import VibrationTracker as VibrationTracker
 from .tracking import follow_vibration as follow_vibration
-from .video import Margins as Margins
 from .video import process_video as process_video
 
 __version__: str

@@ -15,6 +15,7 @@ import rsvib_torch as rsv
 from rsvib_torch.checks.values import members_of
 from rsvib_torch.datasets import city_and_fields
 from rsvib_torch.results.reason import Reason
+from rsvib_torch.video import Margins
 
 TIMING = rsv.SensorTiming(1e-4, 6, 104)
 LONG = rsv.SensorTiming(1e-4, 6, 104, frame_start_times=[0.0, 2.0])
@@ -282,7 +283,7 @@ def test_pixels_beyond_all_scales(value):
         (lambda: flicker(FRAMES[:1], on_fraction=0.5, light_contrast=0.5), "not both"),
         (lambda: flicker(FRAMES[:1], 30.0, frame_rate=29.97), "slower than a frame"),
         (lambda: flicker(torch.full((1, 64, 64), 900, dtype=torch.int16)), "full_scale"),
-        (lambda: rsv.Margins(4, 4, 0, 0).cut(torch.zeros(8, 8)), "leave nothing of frames of 8 x 8 px"),
+        (lambda: Margins(4, 4, 0, 0).cut(torch.zeros(8, 8)), "leave nothing of frames of 8 x 8 px"),
         (lambda: Reason("unknown"), "code must be one of"),
         (lambda: Reason("tone_blind", value=0.05, limit=0.1), "do not fit its text"),
         (lambda: Reason("tone_averaged_out", value="much", limit=0.1), "do not fit its text"),
