@@ -130,7 +130,7 @@ def _run_windows(given: RunOptions, restored: Path, info: io.StackInfo, common: 
         else:
             stored = stacks.read_manifest(out / "manifest.json")
             names += answers.write_windows(folder, stored, given.pixel_size)
-            answer = answers.windows_answer(f"Vibration in {frames.name}", stored, result, given.pixel_size)
+            answer = answers.windows_answer(f"Vibration in {frames.name}", stored, result)
     if result.restored:
         steps.insert(0, answers.page_step(frames, out / "report", settings, *more))
     if not given.video and io.is_video(frames) and result.restored < result.windows:
@@ -193,7 +193,7 @@ def _run_followed(given: RunOptions, restored: Path, common: Table) -> Answer:
     if worse:
         where = f"{len(worse)} of {number_of(result.windows, 'part')} of the video"
         warn(f"restored frames would shake more than the input in {where}, whose rows are left as taken")
-    answer = answers.windows_answer(f"Vibration in {frames.name}", stored, result, given.pixel_size)
+    answer = answers.windows_answer(f"Vibration in {frames.name}", stored, result)
     for name, where in (("frame_to_frame", "from frame to frame"), ("rows", "between the rows of a frame")):
         if stored.shaking is not None:
             before, after = stored.shaking[name]

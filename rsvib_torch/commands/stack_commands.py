@@ -175,7 +175,7 @@ def detect(given: DetectOptions) -> Answer:
         else:
             names = [*answers.write_windows(folder, stored, given.pixel_size), "manifest.json"]
             title = f"Vibration in {len(stored.windows)} windows of {frames.name}"
-            answer = answers.windows_answer(title, stored, pixel_size=given.pixel_size)
+            answer = answers.windows_answer(title, stored)
             if any(record.followed is not None for record in stored.windows):
                 run = ("run", frames, out / "restored", *settings.arguments)
                 follow = ["--follow"] * (windows.get("follow") is True)

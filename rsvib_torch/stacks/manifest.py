@@ -21,10 +21,8 @@ from rsvib_torch.motion.detected_vibration import DetectedVibration, FollowedVib
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.results.presentation import (
     AXIS_NAMES,
-    PHYSICAL_HEAD,
     Result,
     joined_columns,
-    physical_tone,
     plain_values,
 )
 from rsvib_torch.results.result_files import decode
@@ -161,11 +159,10 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
             "bad_frames": self.bad_frames,
         }
 
-    def tone_table(self, pixel_size: float | None = None) -> tuple[list[str], list[list[str]]]:
+    def tone_table(self) -> tuple[list[str], list[list[str]]]:
         """Head and rows of a table of the tones of each axis: median ± standard deviation over the windows.
 
-        Of a vibration that was followed, the amplitudes in the first and in the last frame. With the size of a pixel in
-        m, there are columns in units of length for x and y.
+        Of a vibration that was followed, the amplitudes in the first and in the last frame.
         """
         rows, count, unit = [], len(self.detections()), self._unit
         for name, of_axis in self.totals()["tones"].items():
@@ -176,21 +173,16 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
                 ]
                 if unit != "windows" and tone["windows"]:
                     texts[0] = f"{tone['first']:.4g} … {tone['last']:.4g}"
-                if pixel_size is not None:
-                    known = tone["windows"] and name in ("x", "y")
-                    physical = physical_tone(tone["amplitude"], tone["frequency"], pixel_size).values() if known else ()
-                    texts += [measured_text(value) for value in physical] or [""] * len(PHYSICAL_HEAD)
                 rows.append([name, f"{tone['windows']} of {count}", *texts])
-        head = ["axis", f"reliable {unit}", "amplitude (px)", "frequency (Hz)"]
-        return [*head, *(PHYSICAL_HEAD if pixel_size is not None else ())], rows
+        return ["axis", f"reliable {unit}", "amplitude (px)", "frequency (Hz)"], rows
 
-    def lines(self, pixel_size: float | None = None) -> tuple[list[str], list[str]]:
+    def lines(self) -> tuple[list[str], list[str]]:
         """The totals as lines of text: about the vibration, and about the restoration."""
         data = self.totals()
         spread = f"median ± standard deviation over the {self._unit}"
         if self._unit != "windows":
             spread = f"amplitude: in the first and the last frame; frequency: {spread}"
-        vibration = [text_table(*self.tone_table(pixel_size)), spread]
+        vibration = [text_table(*self.tone_table()), spread]
         followed = [record for record in self.windows if record.followed is not None]
         if followed and self.settings.get("follow") == "auto":
             which = "all" if len(followed) == len(self.windows) else f"{len(followed)} of {len(self.windows)}"
@@ -240,10 +232,6 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
                     number, why = next(iter(refused.items()))
                     text = f"{name} is restored as measured, but is not reliable in"
                     vibration.append(wrapped(f"{text} {number_of(len(refused), 'window')}; in window {number}: {why}"))
-        if data["errors"]:
-            window, error = next(iter(data["errors"].items()))
-            failed = f"detection or restoration failed in {number_of(len(data['errors']), 'window')}"
-            vibration.append(wrapped(f"{failed}; in window {window}: {error}"))
         return vibration, restoration
 
     @property

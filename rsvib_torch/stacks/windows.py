@@ -89,7 +89,6 @@ class WindowRecord:
     detection: DetectedVibration | None  # None if it failed; of a window that was followed, a batch of its frames
     left_alone: tuple[Reason, ...]  # a reason for each axis that was not restored
     outcome: str | None  # ``RestorationVerdict.overall``; None if the frames could not be compared
-    summary: str | None  # ``RestorationVerdict.sentence``
     predicted_gain: float | None  # dB, mean of ``RestorationVerdict.predicted_gain``; None if unknown
     error: str | None  # why detection or restoration failed
     bad_frames: dict[str, str]  # index of each frame that could not be used, with the reason
@@ -113,7 +112,6 @@ def record_fields(
         "frames": "restored" if restored else "as taken",
         "detection": None if detection is None else DetectedVibration.of(detection).to("cpu"),
         "outcome": None if verdict is None else verdict.overall,
-        "summary": None if verdict is None else verdict.sentence,
         "predicted_gain": None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),
         "bad_frames": {str(index): reason for index, reason in bad_frames.items()},
     }
