@@ -140,11 +140,12 @@ class StackJob:
         usable = {index: one for index, one in read.items() if index not in faults and not isinstance(one, str)}
         inside = [index for index in usable if window.first <= index <= window.last]
         kept = tuple(index for index in inside if index in window.written)
-        taken, timing = self._images([usable[index] for index in inside]), window_timing(self.timing, window, inside)
+        taken = self._images([usable[index] for index in inside])
         bad = {index: fault for index, fault in faults.items() if index in window.written}
         result = WindowResult(window, kept, self._unchanged(taken[: len(kept)]), None, None, None, bad)
         if faults and len(inside) < 2:
             return replace(result, error=next(iter(faults.values())))
+        timing = window_timing(self.timing, window, inside)
         try:
             # 2. Their motion.
             motion = self._motion(window, usable, taken, timing)
