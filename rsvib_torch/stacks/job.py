@@ -36,7 +36,7 @@ from rsvib_torch.options import (
     VibrationOptions,
 )
 from rsvib_torch.restoration.restore import check_optics
-from rsvib_torch.results.presentation import Summarised
+from rsvib_torch.results.presentation import Summarised, plain_values
 from rsvib_torch.stacks.memory import windows_at_once
 from rsvib_torch.stacks.window_restoration import (
     MARGIN,
@@ -47,7 +47,7 @@ from rsvib_torch.stacks.window_restoration import (
     restore_trusted,
     without_data,
 )
-from rsvib_torch.stacks.windows import Window, WindowRecord, cut_windows, record_fields, window_timing
+from rsvib_torch.stacks.windows import Window, WindowRecord, cut_windows, window_timing
 from rsvib_torch.tracking.following import follow_vibration
 
 WindowFrames = list[Array | str]  # pixels as stored, or why a frame cannot be read
@@ -104,8 +104,8 @@ class StackJob:
     timing: SensorTiming  # timing of the whole stack
     # with the full scale (None for floats) and the device that are used; ``restoration`` None is detection only
     options: ProcessStackOptions
-    # motions to use instead of a detection, from the first frame of the window with that number; None: it has none
-    given: Mapping[int, DetectedVibration | FreeMotion | None] | None = None
+    # of every window, the motion to use instead of a detection, from its first frame on; None: it has none
+    given: Sequence[DetectedVibration | FreeMotion | None] | None = None
 
     def open(self) -> FrameReader:
         """Open the stack, which must not have changed."""
@@ -246,12 +246,16 @@ class StackJob:
         followed = result.indices if isinstance(result.detection, FollowedVibration) else None
         verdict = None if restoration is None else restoration.verdict
         return WindowRecord(
-            **record_fields(verdict, result.bad_frames, result.detection, restored=result.restored),
             window=window.index,
             first=window.first,
             last=window.last,
             start_time=float(self.timing.frame_starts(window.first + 1)[-1]),
             written=written,
+            frames="restored" if result.restored else "as taken",
+            detection=None if result.detection is None else DetectedVibration.of(result.detection).to("cpu"),
+            outcome=None if verdict is None else verdict.overall,
+            predicted_gain=None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),
+            bad_frames={str(index): reason for index, reason in result.bad_frames.items()},
             left_alone=() if restoration is None else restoration.left_alone,
             error=result.error,
             followed=followed,
@@ -308,7 +312,7 @@ def _follows(options: ProcessStackOptions) -> bool | Literal["auto"]:
 
 def _given(
     options: ProcessStackOptions, info: StackInfo, timing: SensorTiming, windows: list[Window]
-) -> dict[int, DetectedVibration | FreeMotion | None] | None:
+) -> Sequence[DetectedVibration | FreeMotion | None] | None:
     """The given motion of every window, with the time origin at its first frame; None if none is given."""
     motion, given = options.motion, options.given
     if motion is None:
@@ -317,14 +321,14 @@ def _given(
                 f"given has {len(given)} detections for {len(windows)} windows of at most {options.window} frames; "
                 "pass one for each window"
             )
-        return None if given is None else dict(enumerate(given))
+        return given
     if options.detection or given is not None or not isinstance(motion, FreeMotion):
         raise ValueError("motion must be a FreeMotion; it has no detection, given detections or follow beside it")
     starts: list[float] = (timing.frame_starts(info.shape[0]) - timing.frame_starts(1)).tolist()
     readout = info.shape[int(timing.scan_axis)] * timing.row_time + timing.exposure_time
     ends = [(starts[window.first], starts[window.last]) for window in windows]
     parts = [motion.within(first - readout, last + 2 * readout).retimed(first) for first, last in ends]
-    return {window.index: part.to(options.device) for window, part in zip(windows, parts, strict=True)}
+    return [part.to(options.device) for part in parts]
 
 
 def plan_job(

@@ -58,7 +58,6 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
     settings: Table  # sensor and options
     versions: Table  # of the packages that computed it
     output: Table | None  # name of the output; None for detection only
-    bad_frames: dict[str, str]  # index of each frame that could not be used, with the reason
     windows: tuple[WindowRecord, ...]
     not_kept: tuple[str, ...] = ()  # metadata of the input that the output does not contain
     margins: dict[str, int] | None = None  # px that were cut off the sides of the frames of a video
@@ -129,6 +128,11 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
         """Time of each of the ``detections`` in s: start of the window, or middle of the frame."""
         found = ((record.start_time, frame, middle) for record, frame, _, middle in self._results())
         return [start if frame is None or middle is None else middle for start, frame, middle in found]
+
+    @property
+    def bad_frames(self) -> dict[str, str]:
+        """Index of each frame that could not be used, with the reason."""
+        return {index: reason for record in self.windows for index, reason in record.bad_frames.items()}
 
     @property
     def shaking(self) -> dict[str, tuple[float, ...]] | None:
@@ -284,25 +288,21 @@ def _tones_over_windows(found: Sequence[DetectedVibration | None], axis: int) ->
 def fingerprint(path: Path) -> Table:
     """Name, size and hash of a file, with ``NAME.json`` beside it, or of a folder.
 
-    The hash covers the names and sizes of all files, and up to 32 evenly spaced blocks of 64 KiB of up to 32 of them,
-    the first and the last included: files of up to 2 MiB completely.
+    The hash covers the names and sizes of all files, and about 32 evenly spaced blocks of 64 KiB of about 32 of them:
+    files of up to 2 MiB completely.
     """
-
-    def spread(count: int) -> list[int]:
-        return sorted(set(np.linspace(0, count - 1, min(count, 32)).round().astype(int).tolist()))
-
     name, (path, _) = path.name, split_range(path)
     members = path.rglob("*") if path.is_dir() else (path, path.with_name(f"{path.name}.json"))
     files = sorted(file for file in members if file.is_file())
     sizes = [file.stat().st_size for file in files]
     digest, block = hashlib.sha256(), 1 << 16
-    for file, size in zip(files, sizes, strict=True):
+    for number, (file, size) in enumerate(zip(files, sizes, strict=True)):
         digest.update(os.fsencode(file.relative_to(path.parent)) + f"\0{size}\0".encode())
-    for number in spread(len(files)):
-        with files[number].open("rb") as opened:
-            for index in spread(-(-sizes[number] // block)):
-                opened.seek(index * block)
-                digest.update(opened.read(block))
+        if number % -(-len(files) // 32) == 0:
+            with file.open("rb") as opened:
+                for begin in range(0, size, max(block, size // 32)):
+                    opened.seek(begin)
+                    digest.update(opened.read(block))
     return {"name": name, "bytes": sum(sizes), "sha256_of_samples": digest.hexdigest()}
 
 
@@ -314,7 +314,7 @@ def manifest_header(job: StackJob, output: str | None, compression: str | None) 
     """Everything on which the result depends, for JSON: a run is resumed only if it is unchanged."""
     given = None
     if job.given is not None:
-        plain = [DetectedVibration.of(one) if isinstance(one, DetectedVibration) else one for one in job.given.values()]
+        plain = [DetectedVibration.of(one) if isinstance(one, DetectedVibration) else one for one in job.given]
         given = hashlib.sha256(json.dumps(plain_values(plain)).encode()).hexdigest()
     options = {name: getattr(job.options, name) for name in _SETTINGS}
     options["device"] = job.options.device.partition(":")[0]
@@ -324,13 +324,6 @@ def manifest_header(job: StackJob, output: str | None, compression: str | None) 
         "versions": {name: version(name) for name in ("rsvib_torch", "torch", "numpy")},
         "output": None if output is None else {"name": output, "compression": compression},
     }
-
-
-def stack_manifest(header: Table, records: Iterable[WindowRecord]) -> StackManifest:
-    """The manifest of a run, from its header and the records of all windows."""
-    windows = tuple(records)
-    bad = {index: reason for record in windows for index, reason in record.bad_frames.items()}
-    return StackManifest(**header, bad_frames=bad, windows=windows)
 
 
 @checks_arguments

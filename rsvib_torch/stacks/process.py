@@ -19,7 +19,7 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import DetectStackOptions, ProcessStackOptions, Progress, StackOptions
 from rsvib_torch.stacks.job import StackJob, StoredWindow, WindowFrames, WindowResult, plan_job, read_windows
-from rsvib_torch.stacks.manifest import manifest_header, stack_manifest
+from rsvib_torch.stacks.manifest import StackManifest, manifest_header
 from rsvib_torch.stacks.memory import share_one_heap
 from rsvib_torch.stacks.run_folder import RunFolder, StackReport, check_space, run_to_file
 from rsvib_torch.stacks.windows import Window
@@ -76,7 +76,7 @@ def detect_stack(source: PathLike, sink: PathLike, timing: SensorTiming, options
     check_writable(Path(sink))
     results = _computed(job, windows, lambda result, _: (list[Array](), job.record(result, 0)), at_once=at_once)
     records = (record for _, record in _watched(results, windows, windows, [], options.progress))
-    stack_manifest(manifest_header(job, None, None), records).save(sink)
+    StackManifest(**manifest_header(job, None, None), windows=tuple(records)).save(sink)
 
 
 @file_options(ProcessStackOptions)

@@ -31,7 +31,7 @@ from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
 from rsvib_torch.stacks.job import stored_frame
 from rsvib_torch.stacks.recorded_motion import compared_pairs
-from rsvib_torch.stacks.windows import WindowRecord, record_fields
+from rsvib_torch.stacks.windows import WindowRecord
 from rsvib_torch.tracking.camera_path import (
     SIGNIFICANT,
     WINDOW_FRAMES,
@@ -244,20 +244,21 @@ class VideoPasses:
                 )
                 if not sizes.any()
             ]
-        faults = {track.index: track.fault for track in tracks if track.fault is not None}
         moved = any(bool(track.motion.moving_axes().any()) for track in tracks if track.fault is None)
         shaking = self.shaking(motion, tracks)
         helps = shaking is not None and any(after < before for before, after in shaking.values())
         outcome = "worse" if is_worse else "helps" if helps else None
         return WindowRecord(
-            **record_fields(None, faults, detection, restored=moved) | {"outcome": outcome},
             window=part,
             first=tracks[0].index,
             last=tracks[-1].index,
             start_time=tracks[0].time,
             written=len(tracks),
+            frames="restored" if moved else "as taken",
+            detection=detection,
+            outcome=outcome,
+            bad_frames={str(track.index): track.fault for track in tracks if track.fault is not None},
             left_alone=tuple(left),  # tones are removed as they were measured, whatever explains them
-            error=None,
             shaking=shaking,
         )
 

@@ -9,7 +9,7 @@ import tifffile
 from program import refused, rsvib
 from small_stack import CAMERA, HEIGHT, STILL, WIDTH, write_small
 
-from rsvib_torch import read_stack, read_stack_info, write_stack
+from rsvib_torch import read_manifest, read_stack, read_stack_info, write_stack
 from rsvib_torch.datasets import example_frames
 
 FRAMES = 13
@@ -138,7 +138,7 @@ def test_bad_frames_are_reported(place, tmp_path, capsys):
     assert rsvib(*arguments) == 0
     assert "warning: 1 frame could not be used: see manifest.json" in capsys.readouterr().err
     assert read_stack_info(tmp_path / "out" / "restored.tif").shape == (FRAMES, HEIGHT, WIDTH)
-    assert list(json.loads((tmp_path / "out" / "manifest.json").read_text())["bad_frames"]) == ["4"]
+    assert list(read_manifest(tmp_path / "out" / "manifest.json").bad_frames) == ["4"]
 
 
 @pytest.mark.parametrize(

@@ -211,7 +211,7 @@ WINDOW = {"window": 0, "first": 0, "last": 3, "start_time": 0.0, "written": 4, "
 WINDOW |= dict.fromkeys(("detection", "outcome", "predicted_gain"))
 WINDOW |= {"error": "all pixels of frame 2 are equal", "bad_frames": {"2": "all pixels are equal"}}
 MANIFEST = {"format": "rsvib stack", "version": 1, "output": None, "windows": [WINDOW, WINDOW | {"window": 1}]}
-MANIFEST |= {name: {} for name in ("input", "settings", "versions", "bad_frames")}
+MANIFEST |= {name: {} for name in ("input", "settings", "versions")}
 
 
 @pytest.mark.parametrize(
