@@ -269,8 +269,6 @@ def _cut(planes: Planes, margins: Margins | None) -> Planes:
     """Planes without margins; those of chroma are half as wide."""
     if margins is None:
         return planes
-    first, *others = planes
-    luma = margins.cut(first)
-    rows, columns = luma.shape[-2] // 2, luma.shape[-1] // 2  # even, as the margins are, see ``VideoFrames.margins``
-    top, left = margins.top // 2, margins.left // 2
-    return [luma, *(plane[..., top : top + rows, left : left + columns] for plane in others)]
+    luma, top, left = margins.cut(planes[0]), margins.top // 2, margins.left // 2
+    rows, columns = luma.shape[-2] // 2, luma.shape[-1] // 2
+    return [luma, *(chroma[..., top : top + rows, left : left + columns] for chroma in planes[1:])]

@@ -1,4 +1,4 @@
-"""Restoration of one frame of a video: its planes, and margins.
+"""Restoration of one frame of a video: its planes.
 
 Invariant: the displacement depends on the row only (docs/architecture.md); with roll and zoom also linearly on the
 column.
@@ -27,7 +27,6 @@ from rsvib_torch.numerics.splines import mirrored
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.restoration.restore import WITH_SATURATION, restore_prepared
 from rsvib_torch.stacks.job import StackJob
-from rsvib_torch.video import Margins
 
 _LOBES = 4  # of the kernel of Lanczos on each side
 # of pixels, or of Y and chroma: Y has 44.8 dB with Lanczos and 44.5 dB with the cubic kernel, chroma 46.9 and 47.0 dB
@@ -99,12 +98,6 @@ class VideoFrames:
             return [np.zeros(self.job.info.shape[1:], self.job.info.dtype)]
         height, width = self.size
         return [np.full((height, width), 16, np.uint8), np.full((2, height // 2, width // 2), 128, np.uint8)]
-
-    def margins(self, margins: Margins) -> Margins:
-        """The margins, widened to whole pixels of every plane."""
-        if not self.planar:
-            return margins
-        return Margins(*(side + side % 2 for side in (margins.top, margins.bottom, margins.left, margins.right)))
 
     def restored(self, frame: Frame, track: FrameTrack) -> list[Frame]:
         """Planes of a restored frame, as taken if it could not be used."""

@@ -169,7 +169,10 @@ class VideoPasses:
         return not isinstance(path, CameraPath) or path.nearest(frames[len(frames) // 2]).residual < path.allowed
 
     def margins(self, motion: VideoMotion) -> Margins:
-        """The widest margins of all frames: how far outside of the frame the content of its border was recorded."""
+        """The widest margins of all frames: how far outside of the frame the content of its border was recorded.
+
+        They are even, i.e. whole pixels of chroma.
+        """
         widest = np.zeros(4)
         for index in range(len(self.starts)):
             if index not in motion.faults:
@@ -178,7 +181,7 @@ class VideoPasses:
                 x, y = (x, y) if timing.scan_axis == -2 else (x.T, y.T)
                 sides = [-y[0].min(), y[-1].max(), -x[:, 0].min(), x[:, -1].max()]
                 widest = np.maximum(widest, sides)
-        return self.frames.margins(Margins(*(math.ceil(side + 0.5) if side > 0.01 else 0 for side in widest)))
+        return Margins(*(2 * math.ceil(0.5 * (side + 0.5)) if side > 0.01 else 0 for side in widest))
 
     # Whether restoration helps, and the record of a part
 
