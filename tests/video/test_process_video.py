@@ -209,14 +209,15 @@ def test_tones_of_a_video_have_the_standard_deviation_of_the_row_time(clip, tmp_
         assert bool((error.abs() < 2 * getattr(found.std, name)[:, 0]).all())
 
 
-def test_constant_frames_repeat_the_frame_before(frames, tmp_path):
+def test_constant_frames_repeat_the_frame_before_and_the_first_one_the_frame_behind(frames, tmp_path):
     changed = frames[:20].copy()
-    changed[12] = 128
+    changed[[0, 12]] = 128
     source = write(tmp_path / "clip.mkv", changed, codec="ffv1", options={}, encoded="bgr0")
     report = process_video(source, tmp_path / "still.mkv", TIMING, **OPTIONS)
     restored = pixels(tmp_path / "still.mkv")
     assert np.array_equal(restored[12], restored[11])
-    assert report.bad_frames == 1
+    assert np.array_equal(restored[0], restored[1])
+    assert report.bad_frames == 2
     assert decibel(restored[12], STILL, 16) > 30
     assert decibel(restored[13], STILL, 16) > 30
 
