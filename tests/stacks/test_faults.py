@@ -86,7 +86,7 @@ def test_resuming_a_complete_run_changes_nothing(whole, tmp_path):
 def test_full_disk_is_an_error_before_the_computation(whole, tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=100_000))
     with pytest.raises(OSError, match=r"No space left on device: a run needs 418 KB, 100 KB are free"):
-        process_small(whole / "frames.tif", tmp_path / "out.npy")
+        process_small(whole / "frames.tif", tmp_path / "new" / "out.npy")
     assert list(tmp_path.iterdir()) == []
 
 
