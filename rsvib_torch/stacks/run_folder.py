@@ -80,7 +80,7 @@ class RunFolder:
     """
 
     def __init__(self, sink: Path, header: Mapping[str, object], *, resume: bool) -> None:
-        self.sink, self.path = sink, work_folder(sink)
+        self.sink, self.path, self._above = sink, work_folder(sink), nearest_folder(sink)
         self._finished: dict[int, tuple[WindowRecord, list[str]]] = {}  # record and names of the files of windows
         self._key = _blake2b(json.dumps(header, sort_keys=True).encode()).digest()
         atomic.make_folder(self.path.parent)
@@ -219,7 +219,7 @@ class RunFolder:
         return [name for window in sorted(self._finished) for name in self._finished[window][1]]
 
     def remove(self) -> None:
-        """Remove the folder.
+        """Remove the folder, and the empty folders above it that were created for it.
 
         It is renamed first: if the process is killed meanwhile, ``temporary_folder`` removes the rest later.
         """
@@ -229,6 +229,11 @@ class RunFolder:
             self.path.rename(hidden)
             sync(hidden.parent)
             shutil.rmtree(hidden, ignore_errors=True)
+        with suppress(OSError):  # folders that others use
+            folder = self.path.absolute().parent
+            while folder != self._above:
+                folder.rmdir()
+                folder = folder.parent
 
     def close(self) -> None:
         """Release the folder; it is removed if it contains no finished window."""

@@ -155,7 +155,7 @@ def test_window_without_two_usable_frames_is_written_unchanged(whole, tmp_path):
 def test_stack_without_detection_leaves_no_files(tmp_path):
     np.save(tmp_path / "frames.npy", np.full((40, 64, 64), 9, np.uint8))
     with pytest.raises(ValueError, match="frame 0 is constant"):
-        rsv.process_stack(tmp_path / "frames.npy", tmp_path / "out.npy", TIMING, window=3)
+        rsv.process_stack(tmp_path / "frames.npy", tmp_path / "new" / "deep" / "out.npy", TIMING, window=3)
     assert [path.name for path in tmp_path.iterdir()] == ["frames.npy"]
 
 
