@@ -52,6 +52,7 @@ def read_gpmf(path: Path) -> tuple[Array, Array, str, str]:
 class CameraTrack:
     """What the GPMF track of a video states about its frames."""
 
+    times: Array  # (N,) s, of the exposures in the video
     exposures: Array  # (N,) s (SHUT); empty if they are not stated
     turned: float  # rad, largest rotation of an image against the camera (IORI); 0 if it is not stated
 
@@ -59,6 +60,10 @@ class CameraTrack:
     def stabilised(self) -> bool:
         """Whether the camera has stabilised its images."""
         return self.turned > _SMALLEST_TURN
+
+    def exposures_at(self, times: Array) -> Array:
+        """Exposures in s of frames at times in s of the video."""
+        return np.interp(times, self.times, self.exposures)
 
 
 def read_camera_track(path: Path) -> CameraTrack | None:
@@ -71,19 +76,20 @@ def read_camera_track(path: Path) -> CameraTrack | None:
     with path.open("rb") as file:
         if not is_mp4(file.read(64)):
             return None
-    exposures, turned, packet = list[Array]([np.zeros(0)]), 0.0, None
+    times, exposures, turned, packet = list[Array]([np.zeros(0)]), list[Array]([np.zeros(0)]), 0.0, None
     try:
         for packet in _packets(path):
             for stream in (stream for _, streams in packet.devices() for stream in streams):
                 shutter = _found(stream, b"SHUT")
                 if len(shutter) and (shutter > 0).all():
+                    times.append(packet.start + packet.duration / len(shutter) * np.arange(len(shutter)))
                     exposures.append(shutter[:, 0])
                 turned = max(turned, _largest_turn(stream))
     except (ValueError, struct.error, IndexError) as error:
         problem = str(error).removeprefix(f"{path}: ")
         warnings.warn(f"{path}: the GPMF track is damaged and is not used: {problem}", stacklevel=2)
         return None
-    return None if packet is None else CameraTrack(np.concatenate(exposures), turned)
+    return None if packet is None else CameraTrack(np.concatenate(times), np.concatenate(exposures), turned)
 
 
 _Stream = dict[bytes, tuple[bytes, int, bytes]]  # type, size of a value and content of the entries of each key

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field, replace
 from itertools import chain, count, groupby, islice
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from rsvib_torch.checks.arrays import PathLike
@@ -56,8 +57,8 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
     of 4:2:0 videos are restored as they are stored: luma with the method, chroma, which has half the resolution, with
     ``"dewarp"``; H.264 gets 8 of 10 bits. Decoding, restoration and encoding run in threads.
 
-    If the track of a GoPro video states that the camera has stabilised the images (``IORI``), they are moved as a
-    whole, without tones and wobble.
+    If the track of a GoPro video states the exposure of every frame (``SHUT``), it replaces that of ``timing``. If it
+    states that the camera has stabilised the images (``IORI``), they are moved as a whole, without tones and wobble.
 
     Tones that sweep are followed in windows of 24 frames, where others leave more than 0.3 px.
 
@@ -114,6 +115,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
             "gyroscope": None if recording is None else fingerprint(recording),
             "camera": video.camera and asdict(video.camera),
             "stabilised": video.stabilised,
+            "exposures": None if video.exposures is None else [min(video.exposures), max(video.exposures)],
         },
     }
 
@@ -194,12 +196,22 @@ def _planned(
             f"{source}: to be followed, a video needs at least 3 frames, it has {job.info.shape[0]}; use process_stack "
             "(rsvib run without --video)"
         )
-    starts = job.timing.frame_starts(job.info.shape[0])
-    track = read_camera_track(split_range(source)[0])
+    times = job.timing.frame_starts(job.info.shape[0]).tolist()
+    starts = np.array(times) - times[0]
+    # What the track of a GoPro video states of its frames. Rows are read at equal intervals, where exposures end:
+    # frames of a longer exposure are exposed earlier in the mean.
+    whole, part = split_range(source)
+    track, exposures = read_camera_track(whole), None
+    if track is not None and len(track.exposures):
+        begin = 0.0 if part is None else part[0] * job.timing.frame_period
+        exposures = track.exposures_at(starts + begin)
+        starts = starts - 0.5 * (exposures - job.timing.exposure_time)
+        starts = starts - starts[0]
     stabilised = track is not None and track.stabilised
+    stated = None if exposures is None else exposures.tolist()
     profile, (height, width) = options.lens_profile, frames.size
     camera = None if profile is None else Camera.from_gyroflow(profile, width, height)
-    return VideoPasses(frames, options, (starts - starts[0]).tolist(), rates, camera, stabilised), at_once
+    return VideoPasses(frames, options, starts.tolist(), rates, camera, stated, stabilised), at_once
 
 
 @dataclass(frozen=True, eq=False)

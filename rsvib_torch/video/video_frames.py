@@ -43,6 +43,7 @@ class FrameTrack:
     time: float  # s, exposure start of its first row, from the first frame
     motion: Vibration | FreeMotion  # the motion to remove, in image axes; its time origin is the middle of the frame
     fault: str | None = None  # why the frame could not be used; None if it was used
+    exposure: float | None = None  # s, of this frame; None: that of the sensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +108,7 @@ class VideoFrames:
         results: list[Frame] = []
         for number, plane in enumerate(planes):
             motion = track.motion if number == 0 else _on_half_pixels(track.motion)
-            timing = self.timing_of(number)
+            timing = self.timing_of(number, track.exposure)
             separately = number == 0 and method != "dewarp"
             if separately and isinstance(motion, Vibration) and bool((motion.amplitude > 0).any()):
                 # The method undoes what varies between the rows along x and y, and the rest is moved afterwards.
@@ -125,9 +126,11 @@ class VideoFrames:
                 results.append(_with_pixels_moved(plane, source, _KERNELS[number]))
         return results
 
-    def timing_of(self, plane: int) -> SensorTiming:
+    def timing_of(self, plane: int, exposure: float | None = None) -> SensorTiming:
         """Timing of one frame, with the time origin in its middle; rows of chroma lie between two of luma."""
         timing = self.job.timing
+        if exposure is not None:
+            timing = replace(timing, exposure_rows=min(exposure / timing.row_time, timing.frame_rows))
         half = timing.time_to_middle(self.size[int(timing.scan_axis)])
         if plane == 0:
             return replace(timing, frame_start_times=(-half,))

@@ -87,6 +87,7 @@ class VideoPasses:
     starts: list[float]  # s, exposure start of every frame, from the first one
     rates: AngularRates | None  # of a gyroscope, whose rotation is the path
     camera: Camera | None  # whose lens is known; None: its focal length is fitted
+    exposures: list[float] | None  # s, of the frames; None: all that of the sensor
     stabilised: bool  # by the camera: frames move as a whole, without rows that are read one after another
 
     @property
@@ -155,7 +156,8 @@ class VideoPasses:
 
     def track(self, motion: VideoMotion, index: int) -> FrameTrack:
         """What is removed from a frame."""
-        return FrameTrack(index, self.starts[index], motion.removed(index), motion.faults.get(index))
+        exposure = None if self.exposures is None else self.exposures[index]
+        return FrameTrack(index, self.starts[index], motion.removed(index), motion.faults.get(index), exposure)
 
     def left_alone(self, track: FrameTrack) -> FrameTrack:
         """What is removed from a frame of a part that restoration makes worse: rows are not moved apart."""
@@ -208,8 +210,8 @@ class VideoPasses:
     def _restored_corners(self, motion: VideoMotion, pair: tuple[FrameTrack, FrameTrack], corners: Corners) -> Corners:
         """Corners between two frames where they are in the restored ones."""
         places: list[Array] = []
-        exposure = self.frames.job.timing.exposure_time
         for number, track in enumerate(pair):
+            exposure = self.frames.timing_of(0, track.exposure).exposure_time
             starts = corners.times[:, number] - motion.times[track.index] - 0.5 * exposure
             recorded = corners.places + (number - 0.5) * corners.offsets
             places.append(places_at_rest(track.motion, recorded, starts, exposure))

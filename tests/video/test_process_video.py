@@ -351,6 +351,7 @@ def test_frames_that_the_camera_has_stabilised_are_moved_as_a_whole(tmp_path, ca
     settings = read_manifest(tmp_path / "out" / "manifest.json").settings
     assert settings["video"]["stabilised"] is True
     assert settings["sensor"]["exposure_rows"] == pytest.approx(4, rel=1e-3)
+    assert settings["video"]["exposures"] == pytest.approx([6e-4, 6e-4])
     before, after = (data for data in json.loads(shown.out)["shaking"]["frame_to_frame"])
     assert after < 0.1 * before
     rows = json.loads(shown.out)["shaking"]["rows"]
