@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
@@ -117,7 +117,7 @@ class VideoPasses:
             with ONE_BLAS_THREAD:
                 path = camera_path(found.pairs(progress), timing, self.frames.size, has_tones=not self.stabilised)
             places = path.places(found.taken)
-            shift = self._to_steady(times, lambda number, others: places[others] - places[number])
+            shift = self._to_steady(times, lambda number, others: places[others] - places[number], found.cuts)
             polynomials = np.stack([path.derivatives(found.taken, 1), path.derivatives(found.taken, 2), shift], 1)
             polynomials[:, :2] *= path.displaces_rows and not self.stabilised
 
@@ -140,8 +140,8 @@ class VideoPasses:
 
         return VideoMotion(aligned, found.taken, by_gyroscope, found.faults, found.corners)
 
-    def _to_steady(self, times: Array, apart: Callable[[int, slice], Array]) -> Array:
-        return steady_shifts(times, apart, self.options.steady, self.frames.size, self.options.crop_limit)
+    def _to_steady(self, times: Array, apart: Callable[[int, slice], Array], cuts: Sequence[int] = ()) -> Array:
+        return steady_shifts(times, apart, self.options.steady, self.frames.size, self.options.crop_limit, cuts)
 
     def _removed(self, tones: list[Tone], polynomial: Array) -> Vibration:
         """The tones, skew and wobble by the path, and what the path is not smooth by."""
@@ -379,10 +379,16 @@ class _FirstPass:
         self.corners: dict[int, Corners] = {}  # between a frame and the next one, of the first frames of each part
         self.compared: dict[int, Corners] = {}  # with a gyroscope, likewise, of some frames of the video
         self._chosen = compared_pairs(len(times)) if video.rates is not None else []
+        self._others: set[int] = set()  # frames that show something else than the frame before
         self._before: tuple[int, NDArray[np.uint8]] | None = None  # the usable frame before, and its number
         self._changes: deque[float] = deque(maxlen=_MEMORY)  # counts, of the frames before
         self._waiting: list[tuple[int, NDArray[np.uint8], float]] = []  # possible copies of it, and their changes
         self._follower = CornerFollower(self._timing)
+
+    @property
+    def cuts(self) -> list[int]:
+        """Numbers of the first frames of further shots; two other frames in a row are a flash."""
+        return [index for index in sorted(self._others) if not self._others & {index - 1, index + 1}]
 
     def pairs(self, progress: Callable[[], None]) -> Iterator[Corners | None]:
         """Corners between each usable frame and the one before; a thread follows them, up to a window ahead."""
@@ -426,7 +432,8 @@ class _FirstPass:
             return ()
         self._changes.append(changed)
         if (corners is None or len(corners.rows) < _FEW) and _shows_other(grey, before[1]):
-            corners = None  # of a cut, or of a flash
+            corners = None
+            self._others.add(index)
         if before[0] == index - 1:
             if corners is not None and index % PART_FRAMES < _CHECKED_FRAMES:
                 self.corners[index - 1] = corners
