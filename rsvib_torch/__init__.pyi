@@ -84,16 +84,12 @@ from .row_time import RowTimeCalibration as RowTimeCalibration
 from .row_time import calibrate_row_time as calibrate_row_time
 from .row_time import calibrate_row_time_by_motion as calibrate_row_time_by_motion
 from .stacks import StackReport as StackReport
-from .stacks import VibrationCorrector as VibrationCorrector
 from .stacks import iterate_stack as iterate_stack
 from .stacks import process_stack as process_stack
 from .stacks import read_manifest as read_manifest
-from .stacks import restore_block as restore_block
 from .tracking import TrackedFrame as TrackedFrame
 from .tracking import VibrationTracker as VibrationTracker
 from .tracking import follow_vibration as follow_vibration
-from .video import Margins as Margins
-from .video import VideoBorder as VideoBorder
 from .video import process_video as process_video
 
 __version__: str

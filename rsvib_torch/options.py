@@ -38,9 +38,8 @@ FilePath = str | os.PathLike[str] | None
 OptionTable = Mapping[str, Any] | None
 Detections = Sequence[Any] | None  # entries are ``DetectedVibration`` or None
 Progress = Callable[[int, int], None] | None
-BorderName = Literal["mirror", "hold", "crop"]
+BorderName = Literal["mirror", "crop"]
 PixelFormat = Literal["gray8", "gray16le", "rgb24", "bgr24"]  # of raw frames in a pipe
-BadFrames = Literal["pass", "skip"]
 Channels = Literal["first", "last"] | None
 DetectionMethod = Literal["direct", "bands"]
 Mosaic = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
@@ -359,7 +358,7 @@ class TrackerOptions(RestorationOptions, InputOptions):
 
 
 @options
-class WindowSize:
+class WindowOptions:
     """The windows that a stack is cut into."""
 
     window: Frames = Field(default=8, json_schema_extra=COMMAND_LINE)
@@ -371,15 +370,6 @@ class WindowSize:
 
 
 @options
-class WindowOptions(WindowSize):
-    """Processing of stacks in windows."""
-
-    bad_frames: BadFrames = Field(default="pass", json_schema_extra=COMMAND_LINE)
-    """Frames that cannot be read or used: ``"pass"`` writes them unchanged (a frame that cannot be read as NaN, or 0
-    for integers), ``"skip"`` leaves them out."""
-
-
-@options
 class ResourceOptions:
     """Memory, threads and device of a run, and the full scale of its stack."""
 
@@ -387,16 +377,15 @@ class ResourceOptions:
     """As in ``read_stack``."""
     memory: str | float | None = None
     """Limit for the memory of the process, in bytes or like ``"2GB"``; by default three quarters of the memory that is
-    free or used by the process. It does not limit Dask workers."""
+    free or used by the process."""
     workers: Annotated[int, Field(ge=1)] | None = None
-    """Largest number of windows, or of frames of a video, to compute at once; by default the number of processors. Of
-    local Dask workers, the number of processes."""
+    """Largest number of windows, or of frames of a video, to compute at once; by default the number of processors."""
     device: str = "auto"
     """``"auto"``, ``"cpu"`` or ``"cuda"``."""
 
 
 @options
-class StackDetectionOptions(WindowSize, ResourceOptions):
+class StackDetectionOptions(WindowOptions, ResourceOptions):
     """Detection in windows."""
 
     detection: OptionTable = None
@@ -438,7 +427,7 @@ class RunOptions(ProgressOptions):
 
 
 @options
-class ProcessStackOptions(RunOptions, WindowOptions, StackOptions):
+class ProcessStackOptions(RunOptions, StackOptions):
     """Options of ``process_stack``."""
 
     given: Detections = None
@@ -446,9 +435,6 @@ class ProcessStackOptions(RunOptions, WindowOptions, StackOptions):
     motion: object = None
     """A ``FreeMotion`` of all frames to use instead of detections, such as a recorded one (``align_motion``): in image
     axes, with the exposure start of the first row of frame 0 as time origin. Frames are restored to its place 0."""
-    scheduler: str | None = None
-    """Address of a Dask scheduler whose workers can read ``source`` under the same path; ``"local"`` starts workers on
-    this machine; None computes in this process."""
     compression: str | None = None
     """Compression of a TIFF stack, zlib or lzma, as in ``write_stack``."""
 
@@ -458,8 +444,8 @@ class ProcessVideoOptions(RunOptions, ResourceOptions):
     """Options of ``process_video``; each of its two passes counts as half of the progress."""
 
     border: BorderName = "mirror"
-    """Pixels that the sensor did not record: ``"mirror"``, extrapolated from each frame by itself; ``"hold"``, as in
-    the frame before; ``"crop"``, cut off by constant margins."""
+    """Pixels that the sensor did not record: ``"mirror"``, extrapolated from each frame by itself; ``"crop"``, cut off
+    by constant margins."""
     steady: NotNegative = 0.0
     """Every frame is moved to a smooth path, and its skew and wobble are undone: shaking whose period is this time in s
     or shorter is removed, slower motion is kept. 0: frames stay where they are, and only vibration is removed."""

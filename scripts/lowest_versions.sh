@@ -9,7 +9,7 @@ cd "$(dirname "$0")/.."
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 uv venv --quiet "$folder/venv"
-uv pip install --quiet --python "$folder/venv/bin/python" --resolution lowest-direct '.[formats,distributed,tables,video]' \
+uv pip install --quiet --python "$folder/venv/bin/python" --resolution lowest-direct '.[formats,tables,video]' \
   'pytest>=8.3' 'hypothesis>=6.100' 'scikit-image>=0.25'
 export OMP_WAIT_POLICY=${OMP_WAIT_POLICY:-passive} OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
 export PYTHONWARNINGS=ignore::DeprecationWarning # of the programs that tests start

@@ -39,7 +39,6 @@ ATTACKS: dict[str, tuple[str, int]] = {  # first column of the table, and number
     "live_sessions": ("recordings of a camera", 196),
     "memory": ("`--memory` in different layouts", 15),
     "crafted": ("crafted files", 200),
-    "workers": ("killed Dask workers", 7),
     "api": ("hostile arguments of Python functions", 4000),
     "mutated": ("randomly damaged files", 2400),
     "spans": ("frames over long time spans", 50),

@@ -131,7 +131,6 @@ CASES = (
         "restoration_mtf": (lambda frames: rsv.restoration_mtf(frames, TIMING, VIBRATION, joint=True, scale=2), FRAMES),
         "restore, holes": (lambda frames, ignore: restore(frames, ignore=ignore, **HARD), FRAMES, FRAMES > 0.8),
         "RowVaryingBlur.A_adjoint": (rsv.RowVaryingBlur(PSF).A_adjoint, FRAMES[0, :8]),
-        "restore_block": (lambda frames: rsv.restore_block(np.asarray(frames), TIMING), FRAMES),
         "restore, no axis": (partial(restore, vibration=REFUSED), FRAMES),
         "restore, no axis, last": (partial(restore, vibration=REFUSED, channels="last"), FRAMES[..., None]),
         "restore, mosaic": (partial(restore, vibration=REFUSED, mosaic="RGGB"), FRAMES),

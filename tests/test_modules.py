@@ -50,12 +50,12 @@ def modules(blur, vibration):
         yield method, rsv.VibrationRestorer(TIMING, method=method), (small, vibration)
 
 
-def test_corrector_restores_a_batch_and_states_its_options(frames, scene):
-    """One module from frames to restored frames: 5 dB better than the input, with gradients and a representation."""
-    options = {"detection": {"tones": 1}, "restoration": {"method": "dewarp"}}
-    corrector = rsv.VibrationCorrector(TIMING, **options)
+def test_modules_restore_a_batch_and_state_their_options(frames, scene):
+    """From frames to restored frames: 5 dB better than the input, with gradients and a representation."""
+    detector, restorer = rsv.VibrationDetector(TIMING, tones=1), rsv.VibrationRestorer(TIMING, method="dewarp")
     taken = frames.clone().requires_grad_()
-    restored, detection = corrector(taken)
+    detection = detector(taken)
+    restored = restorer(taken, detection)
     assert restored.shape == frames.shape
     assert detection.reliable.all()
     for stack in range(2):
@@ -63,11 +63,11 @@ def test_corrector_restores_a_batch_and_states_its_options(frames, scene):
         assert after > before + 5
     restored.square().mean().backward()
     assert taken.grad.abs().sum() > 0
-    text = repr(nn.Sequential(corrector))
+    text = repr(nn.ModuleList([detector, restorer]))
     assert "VibrationDetector(row_time=4e-05, exposure_rows=30, frame_rows=320, tones=1)" in text
     assert "frame_rows=320, method='dewarp')" in text
     with pytest.raises(TypeError, match="unknown option 'blur'"):
-        rsv.VibrationCorrector(TIMING, restoration={"blur": 1})
+        rsv.VibrationRestorer(TIMING, blur=1)
 
 
 def test_copies_state_and_autocast(frames, blur, vibration):

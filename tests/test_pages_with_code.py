@@ -35,12 +35,12 @@ def test_machine_learning_page():
     assert not torch.equal(pipeline["moved_boxes"], pipeline["boxes"])
     assert pipeline["taken"].shape == (4, 2, 3, 96, 64)
     frames, truth = pipeline["frames"], pipeline["truth"]
-    found = pipeline["model"].corrector.detector(frames).vibration[0]
+    found = pipeline["model"].detector(frames).vibration[0]
     torch.testing.assert_close(found.amplitude, truth.amplitude, rtol=0, atol=0.2)
     height, width = frames.shape[-2:]
     top, left = (320 - height) // 2, (200 - width) // 2
     still = pipeline["scene"][top : top + height, left : left + width]
-    restored = pipeline["model"].corrector.restorer(frames, found)[0, :, 0]
+    restored = pipeline["model"].restorer(frames, found)[0, :, 0]
     assert (rsv.psnr(restored, still, 1.0, rim=16) > rsv.psnr(frames[0, :, 0], still, 1.0, rim=16) + 5).all()
 
 

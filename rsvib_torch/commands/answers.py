@@ -67,10 +67,9 @@ def windows_answer(
     title: str,
     manifest: stacks.StackManifest,
     report: stacks.StackReport | None = None,
-    pixel_size: float | None = None,
 ) -> Answer:
     """The vibration in the windows of a stack, and what was restored."""
-    vibration, restoration = manifest.lines(pixel_size)
+    vibration, restoration = manifest.lines()
     answer = Answer({title: vibration}, {"windows": manifest.totals()}, reliable=verdicts(manifest.detections()))
     if report is not None:
         answer.results["Restoration"] = [report.summary(), *restoration[1:]]
@@ -207,4 +206,5 @@ def warn_of_failures(manifest: stacks.StackManifest) -> None:
     """Print a warning if detection or restoration failed in windows."""
     failed = sum(record.error is not None for record in manifest.windows)
     if failed:
-        warn(f"detection failed in {number_of(failed, 'window')}: see manifest.json")
+        error = next(record for record in manifest.windows if record.error is not None)
+        warn(f"detection failed in {number_of(failed, 'window')}; in window {error.window}: {error.error}")

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import os
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, BinaryIO, Literal
-
-from pydantic import Field
+from typing import TYPE_CHECKING, Annotated, BinaryIO
 
 from rsvib_torch import io, tracking, video
 from rsvib_torch.checks.validation import NotNegative, options
 from rsvib_torch.commands.answers import detection_data
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.shared_options import CameraOptions, check_file
-from rsvib_torch.commands.terminal import Answer, error_line, warn
+from rsvib_torch.commands.terminal import Answer, warn
 from rsvib_torch.files.reading import Table
 from rsvib_torch.options import PixelFormat, TrackerOptions, method_options
 from rsvib_torch.text import number_of
@@ -34,8 +31,6 @@ class LiveOptions(CameraOptions):
     """Number or URL of a camera, - for raw frames on standard input, or a file with frames."""
     out: Path | None = None
     """Video to write (.mp4, .mov, .m4v, .mkv), or - for raw frames to stdout."""
-    page: Annotated[int, Field(ge=0, le=65535)] | None = option(None, metavar="PORT")
-    """Show the restored frames at http://127.0.0.1:PORT."""
     size: str | None = option(None, metavar="WIDTHxHEIGHT")
     """Size of the frames on standard input, e.g. 1024x768."""
     pixel_format: PixelFormat = "gray8"
@@ -50,8 +45,6 @@ class LiveOptions(CameraOptions):
     ]
     steady: NotNegative = option(0.0, metavar="SECONDS")
     """Stabilise the image to a straight line through the last part of its path."""
-    border: Literal["mirror", "hold"] = "mirror"
-    """Pixels that the sensor did not record: mirror, extrapolated; hold, as in the frame before."""
 
 
 def live_session(given: LiveOptions) -> Answer:
@@ -74,11 +67,6 @@ def live_session(given: LiveOptions) -> Answer:
             video.VideoOutput(path, settings.timing.frame_rate, overwrite=given.overwrite) for path in written
         ]
         outputs += [] if stream is None else [video.PipeOutput(stream)]
-        # the page is the last output, because it is the only one that is opened before the first frame
-        page = None if given.page is None else video.PageOutput(given.page)
-        if page is not None:
-            outputs.append(page)
-            error_line(f"the page is {page.url}", "note")
         tracker = tracking.VibrationTracker(
             settings.timing,
             **restoration | given.tracker | {"method": method},
@@ -91,9 +79,7 @@ def live_session(given: LiveOptions) -> Answer:
             source,
             tracker,
             outputs,
-            border=video.VideoBorder(given.border),
             drops=file is None,
-            progress=None if page is None else _state_text(page),
         )
     if report.frames == 0:
         raise ValueError(f"{given.source}: no frame was read")
@@ -141,22 +127,6 @@ def _frames_on_standard_output(*, enabled: bool) -> Iterator[BinaryIO | None]:
     with os.fdopen(os.dup(sys.stdout.fileno()), "wb", buffering=0) as frames:
         sys.stdout = sys.stderr
         yield frames
-
-
-def _state_text(page: video.PageOutput) -> Callable[[tracking.TrackedFrame, video.LiveReport], None]:
-    """Text below the frames of the page, twice per second."""
-    due = 0.0
-
-    def show(tracked: tracking.TrackedFrame, report: video.LiveReport) -> None:
-        nonlocal due
-        if time.perf_counter() < due:
-            return
-        due = time.perf_counter() + 0.5  # s
-        lines = [f"time {tracked.time:.2f} s, {tracked.state}, {report.frames} frames written"]
-        lines += [] if tracked.detection is None else [tracked.detection.summary()]
-        page.show_state("\n".join(lines))
-
-    return show
 
 
 def _answer(source: str, report: video.LiveReport, files: list[Path], *, drops: bool) -> Answer:

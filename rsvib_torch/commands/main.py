@@ -49,7 +49,7 @@ _EXAMPLES = """
   rsvib calibrate led.mp4 --frequency 1000 --frame-rate 29.97 \\
         --out camera.toml
   rsvib calibrate clip.mp4 --by-motion --frame-rate 30 --out camera.toml
-  rsvib live 0 --config camera.toml --page 8080
+  rsvib live 0 --config camera.toml --out still.mp4
   rsvib live rtsp://camera/stream --config camera.toml --out still.mkv \\
         --steady 1
 """

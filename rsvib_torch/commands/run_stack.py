@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 _RESULTS = (*answers.OF_DETECTION, *answers.OF_WINDOWS, "restoration.json", "before_after.png", "report.html")
-_PROCESSING = ("resume", "compression", "memory", "workers", "scheduler")
+_PROCESSING = ("resume", "compression", "memory", "workers")
 
 
 @options
@@ -152,7 +152,7 @@ def _process_windows(
     common = common | {"window": chosen.window, "follow": chosen.follow, "force": given.force}
     common["detection"] = None if chosen.follow is True else settings.detection  # a tracker has none
     manifest, counts = given.out / "manifest.json", info.shape[0] > chosen.window
-    of_run = common | processing | {"bad_frames": chosen.bad_frames, "manifest": manifest}
+    of_run = common | processing | {"manifest": manifest}
     with working(f"restoring {frames.name}", counts=counts) as progress:
         of_run["progress"] = progress if counts else None
         result = stacks.process_stack(frames, restored, settings.timing, **of_run)
@@ -213,7 +213,7 @@ def _describe(folder: Path, given: RunOptions, result: stacks.StackReport, shown
         answer.next_steps = answers.steps_after_detection(found, frames, given.settings)
     else:
         names += answers.write_windows(folder, shown.stored, given.pixel_size)
-        answer = answers.windows_answer(f"Vibration in {frames.name}", shown.stored, result, given.pixel_size)
+        answer = answers.windows_answer(f"Vibration in {frames.name}", shown.stored, result)
     if not given.video and io.is_video(frames) and result.restored < result.windows:
         answer.next_steps.insert(0, answers.run_step(frames, given.out / "followed", given.settings.arguments))
     return answer
@@ -234,7 +234,7 @@ def _describe_video(answer: Answer, stored: stacks.StackManifest, result: stacks
     worse = [record for record in stored.windows if record.outcome == "worse"]
     if worse:
         where = f"{len(worse)} of {number_of(result.windows, 'part')} of the video"
-        warn(f"the restored frames are judged worse than the input in {where}: {worse[0].summary}")
+        warn(f"restored frames would shake more than the input in {where}, whose rows are left as taken")
     for name, where in (("frame_to_frame", "from frame to frame"), ("rows", "between the rows of a frame")):
         if stored.shaking is not None:
             before, after = stored.shaking[name]

@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from functools import cache
 from importlib import import_module
-from itertools import chain, islice, takewhile
+from itertools import islice
 from threading import Lock
 from typing import TypeVar
 
@@ -16,7 +16,6 @@ import torch
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
-Given = TypeVar("Given")
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -125,23 +124,6 @@ def in_parallel(
     return [results[place] for place in range(len(items))]
 
 
-def in_order(
-    items: Iterable[Given],
-    submit: Callable[[Given], Item],
-    capacity: Callable[[], int],
-    result: Callable[[Item], Result],
-    waiting: deque[Item],
-) -> Generator[Result, None, None]:
-    """Results of items in their order; up to ``capacity()`` of them are computed or wait, in ``waiting``."""
-    remaining = iter(items)
-    while True:
-        while len(waiting) < capacity() and (item := next(remaining, None)) is not None:
-            waiting.append(submit(item))
-        if not waiting:
-            return
-        yield result(waiting.popleft())
-
-
 @contextmanager
 def _pool(count: int, threads: int, items: Generator[object, None, None]) -> Iterator[ThreadPoolExecutor]:
     """Threads that use ``threads`` of PyTorch each; they end with the block, and then the source of items is closed."""
@@ -162,15 +144,24 @@ def prefetched(items: Generator[Item, None, None], count: int, threads: int = 1)
     are raised behind the items before them.
     """
     with _pool(1, threads, items) as pool:
-        ones = iter(lambda: islice(items, 1), None)  # parts of one item; of none behind the last
-        ahead: deque[Future[list[Item]]] = deque()
-        made = in_order(ones, lambda one: pool.submit(list, one), lambda: count + 1, Future.result, ahead)
-        yield from chain.from_iterable(takewhile(bool, made))
+        waiting = deque(pool.submit(list, islice(items, 1)) for _ in range(count + 1))
+        while True:
+            made = waiting.popleft().result()
+            if not made:  # there are no further items
+                return
+            yield made[0]
+            waiting.append(pool.submit(list, islice(items, 1)))
 
 
 def in_threads(
     work: Callable[..., Result], items: Generator[tuple[object, ...], None, None], *, at_once: int, threads: int = 1
 ) -> Generator[Result, None, None]:
     """Results of ``work(*item)`` in order, from ``at_once`` threads with ``threads`` of PyTorch each."""
+    waiting: deque[Future[Result]] = deque()
     with _pool(at_once, threads, items) as pool:
-        yield from in_order(items, lambda item: pool.submit(work, *item), lambda: at_once + 1, Future.result, deque())
+        for item in items:
+            waiting.append(pool.submit(work, *item))
+            if len(waiting) > at_once:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()

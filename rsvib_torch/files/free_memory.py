@@ -40,25 +40,21 @@ def _free_addresses() -> Iterator[int]:
             yield limit - int(getattr(used, name, 0))
 
 
-# Limits of versions 2 and 1 (https://docs.kernel.org/admin-guide: cgroup-v2.html, cgroup-v1/memory.html)
-_LIMITS = ("memory.max", "memory.high", "memory.limit_in_bytes")
-
-
 def _free_in_groups(root: Path) -> Iterator[int]:
-    """Free memory of each control group of this process and of those above it, if they have a limit."""
-    for line in _text(root / "proc/self/cgroup").splitlines():
-        _, controllers, name = line.split(":", 2)  # of version 2 no controllers
-        if controllers and "memory" not in controllers.split(","):
-            continue
-        top = root / "sys/fs/cgroup" / ("memory" if controllers else "")
-        group = top / name.lstrip("/")
-        group = group if group.is_dir() else top  # of another namespace: only the top is visible
-        for place in (group, *(above for above in group.parents if above.is_relative_to(top))):
-            cached = re.findall(r"^(?:total_)?inactive_file (\d+)$", _text(place / "memory.stat"), re.MULTILINE)
-            used = (_text(place / "memory.current") or _text(place / "memory.usage_in_bytes")).strip()
-            for limit in (_text(place / name).strip() for name in _LIMITS):
-                if used.isdecimal() and limit.isdecimal():  # not "max"
-                    yield int(limit) - int(used) + max(map(int, cached), default=0)
+    """Free memory of the control group of this process and of those above it, if they have a limit.
+
+    Those of version 2 (https://docs.kernel.org/admin-guide/cgroup-v2.html); version 1 is no longer supported by Linux
+    distributions.
+    """
+    top = root / "sys/fs/cgroup"
+    group = top / _text(root / "proc/self/cgroup").strip().rpartition("::/")[2]
+    group = group if group.is_dir() else top  # of another namespace: only the top is visible
+    for place in (group, *(above for above in group.parents if above.is_relative_to(top))):
+        cached = re.findall(r"^inactive_file (\d+)$", _text(place / "memory.stat"), re.MULTILINE)
+        used = _text(place / "memory.current").strip()
+        for limit in (_text(place / name).strip() for name in ("memory.max", "memory.high")):
+            if used.isdecimal() and limit.isdecimal():  # not "max"
+                yield int(limit) - int(used) + sum(map(int, cached))
 
 
 def _text(path: Path) -> str:

@@ -1,7 +1,4 @@
-from .corrector import CorrectedFrames as CorrectedFrames
-from .corrector import VibrationCorrector as VibrationCorrector
 from .job import WindowResult as WindowResult
-from .job import restore_block as restore_block
 from .manifest import StackManifest as StackManifest
 from .manifest import read_manifest as read_manifest
 from .memory import check_stack_fits as check_stack_fits

@@ -1,7 +1,7 @@
 """The computation of one window: reading its frames, detection, restoration, and the record of the result."""
 
 import os
-from collections.abc import Callable, Generator, Iterable, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,8 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks.arguments import checks_arguments
-from rsvib_torch.checks.arrays import Channels, PathLike, channel_axis
+from rsvib_torch.checks.arrays import PathLike
 from rsvib_torch.checks.values import check_choice
 from rsvib_torch.detection import detect_vibration
 from rsvib_torch.files.reading import Table
@@ -38,7 +37,7 @@ from rsvib_torch.options import (
     VibrationOptions,
 )
 from rsvib_torch.restoration.restore import check_optics
-from rsvib_torch.results.presentation import Summarised
+from rsvib_torch.results.presentation import Summarised, plain_values
 from rsvib_torch.stacks.memory import windows_at_once
 from rsvib_torch.stacks.window_restoration import (
     MARGIN,
@@ -49,7 +48,7 @@ from rsvib_torch.stacks.window_restoration import (
     restore_trusted,
     without_data,
 )
-from rsvib_torch.stacks.windows import Window, WindowRecord, cut_windows, record_fields, window_timing
+from rsvib_torch.stacks.windows import Window, WindowRecord, cut_windows, window_timing
 from rsvib_torch.tracking.following import follow_vibration
 
 WindowFrames = list[Array | str]  # pixels as stored, or why a frame cannot be read
@@ -106,8 +105,8 @@ class StackJob:
     timing: SensorTiming  # timing of the whole stack
     # with the full scale (None for floats) and the device that are used; ``restoration`` None is detection only
     options: ProcessStackOptions
-    # motions to use instead of a detection, from the first frame of the window with that number; None: it has none
-    given: Mapping[int, DetectedVibration | FreeMotion | None] | None = None
+    # of every window, the motion to use instead of a detection, from its first frame on; None: it has none
+    given: Sequence[DetectedVibration | FreeMotion | None] | None = None
 
     def open(self) -> FrameReader:
         """Open the stack, which must not have changed."""
@@ -135,113 +134,111 @@ class StackJob:
 
     def compute(self, window: Window, pixels: WindowFrames) -> WindowResult:
         """Detect the vibration in a window, restore its frames and judge the result."""
+        # 1. The frames that can be used, of the window and around it.
         options, read = self.options, dict(zip(window.frames, pixels, strict=True))
         found = ((index, frame_fault(read[index], index, options.full_scale, self.info.nodata)) for index in read)
         faults = {index: fault for index, fault in found if fault is not None}
         usable = {index: one for index, one in read.items() if index not in faults and not isinstance(one, str)}
-        inside = {index: frame for index, frame in usable.items() if window.first <= index <= window.last}
-        frames = self._images(inside)
-        kept = tuple(index for index in usable if index in window.written)
+        inside = [index for index in usable if window.first <= index <= window.last]
+        kept = tuple(index for index in inside if index in window.written)
+        taken = self._images([usable[index] for index in inside])
         bad = {index: fault for index, fault in faults.items() if index in window.written}
-        as_taken = WindowResult(window, kept, self._unchanged(frames[: len(kept)]), None, None, None, bad)
+        result = WindowResult(window, kept, self._unchanged(taken[: len(kept)]), None, None, None, bad)
         if faults and len(inside) < 2:
-            return replace(as_taken, error=next(iter(faults.values())))
-        if options.follow is True:
-            return self._followed(as_taken, usable)
-        timing = window_timing(self.timing, window, list(inside))
+            return replace(result, error=next(iter(faults.values())))
+        timing = window_timing(self.timing, window, inside)
         try:
-            if self.given is None:
-                motion: DetectedVibration | FreeMotion | None
-                motion = detected = detect_vibration(frames, timing, **options.detection or {})
-                as_taken = replace(as_taken, detection=detected)
-                if options.follow == "auto" and may_change(detected, len(usable)):
-                    followed = self._followed(as_taken, usable)
-                    if isinstance(followed.detection, FollowedVibration):
-                        reliable = followed.detection.reliable.double().mean(0).sum()
-                        if reliable > detected.reliable.sum():
-                            return followed
+            # 2. Their motion.
+            motion = self._motion(window, usable, taken, timing)
+            if motion is None:
+                return replace(result, error="no detection was given for this window")
+            if isinstance(motion, DetectedVibration):
+                result = replace(result, detection=motion)
+            if options.restoration is None:
+                return result
+            # 3. The frames without it.
+            if isinstance(motion, FollowedVibration):
+                taken, timing = taken[: len(kept)], window_timing(self.timing, window, list(kept))
+                restoration = restore_followed(taken, timing, motion, self.chosen, force=options.force)
             else:
-                motion = self.given[window.index]
-                missing = "no detection was given for this window" if motion is None else None
-                detection = motion if isinstance(motion, DetectedVibration) else None
-                as_taken = replace(as_taken, detection=detection, error=missing)
-            if motion is None or options.restoration is None:
-                return as_taken
-            restoration = restore_trusted(
-                frames,
-                timing,
-                motion,
-                self.chosen,
-                force=options.force,
-                first_frames=len(kept) if len(kept) > 1 and not self.chosen.joint else None,
-                most_pairs=8 if window.alone else 2,  # limits the time of the verdict
-            )
+                restoration = restore_trusted(
+                    taken,
+                    timing,
+                    motion,
+                    self.chosen,
+                    force=options.force,
+                    first_frames=len(kept) if len(kept) > 1 and not self.chosen.joint else None,
+                    most_pairs=8 if window.alone else 2,  # limits the time of the verdict
+                )
         except (ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
-            return replace(as_taken, error=" ".join(str(error).split()))
-        if self.chosen.joint is True and restoration.restored:  # one image of all frames
-            as_taken, kept = replace(as_taken, indices=()), tuple(inside)
-        return self._restored(as_taken, frames[: len(kept)], restoration)
-
-    def _restored(self, as_taken: WindowResult, taken: Tensor, restoration: RestoredFrames) -> WindowResult:
-        """The result of a window whose frames were restored, from those frames as taken."""
+            return replace(result, error=" ".join(str(error).split()))
+        result = replace(result, restoration=restoration)
         if not restoration.restored:
-            return replace(as_taken, restoration=restoration)
-        frames = restoration.frames if not as_taken.indices else restoration.frames[: len(as_taken.indices)]
-        frames = frames if self.info.nodata is None else without_data(frames, taken)
-        return replace(as_taken, restoration=restoration, frames=frames)
+            return result
+        # 4. Those that are written, or one image of all.
+        if self.chosen.joint is True:
+            result, frames = replace(result, indices=()), restoration.frames
+        else:
+            taken, frames = taken[: len(kept)], restoration.frames[: len(kept)]
+        return replace(result, frames=frames if self.info.nodata is None else without_data(frames, taken))
 
-    def _images(self, frames: Mapping[int, Array]) -> Tensor:
+    def _motion(
+        self, window: Window, usable: Mapping[int, Array], taken: Tensor, timing: SensorTiming
+    ) -> DetectedVibration | FreeMotion | None:
+        """The motion in the frames ``taken`` of a window, or at each that it writes; None if it should be given."""
+        if self.given is not None:
+            return self.given[window.index]
+        detected = None
+        if self.options.follow is not True:
+            detected = detect_vibration(taken, timing, **self.options.detection or {})
+            if self.options.follow is False or not may_change(detected, len(usable)):
+                return detected
+        try:
+            around = window_timing(self.timing, window, list(usable))
+            found = follow_vibration(self._images(list(usable.values())), around, channels="first")
+        except (ValueError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
+            if detected is None:
+                raise
+            return detected
+        written = [found[number] for number, index in enumerate(usable) if index in window.written]
+        followed = FollowedVibration.stacked(written)
+        if detected is None or followed.reliable.double().mean(0).sum() > detected.reliable.sum():
+            return followed
+        return detected
+
+    def _images(self, frames: Sequence[Array]) -> Tensor:
         """Frames as stored as (T, H, W) or (T, C, H, W), full scale 1."""
         if not frames:
             return torch.empty((0, *self.info.shape[1:]), dtype=torch.float32, device="cpu")
-        return self._as_taken(np.stack(list(frames.values()))).to(self.options.device)
+        return self._as_taken(np.stack(frames)).to(self.options.device)
 
     def _as_taken(self, stored: Array) -> Tensor:
         return counts_to_frames(stored, self.options.full_scale, str(self.source), self.info.nodata)
 
-    def _followed(self, as_taken: WindowResult, usable: Mapping[int, Array]) -> WindowResult:
-        """The result of a window whose vibration is followed, from its usable frames and those around it."""
-        window, kept = as_taken.window, list(as_taken.indices)
-        if not kept:
-            return as_taken
-        try:
-            timing = window_timing(self.timing, window, list(usable))
-            found = follow_vibration(self._images(usable), timing, channels="first")
-            followed = FollowedVibration.stacked([found[number] for number, i in enumerate(usable) if i in kept])
-            as_followed, options = replace(as_taken, detection=followed), self.options
-            if options.restoration is None:
-                return as_followed
-            frames, timing = as_taken.frames, window_timing(self.timing, window, kept)
-            restoration = restore_followed(frames, timing, followed, self.chosen, force=options.force)
-        except (ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
-            return replace(as_taken, error=" ".join(str(error).split()))
-        return self._restored(as_followed, frames, restoration)
-
     def stored(self, result: WindowResult, pixels: WindowFrames) -> StoredWindow:
         """The frames of a result as they are stored: frames that were not restored are unchanged.
 
-        A frame that cannot be read is stored as NaN, or 0 for integers, unless bad frames are omitted.
+        A frame that cannot be read is stored as NaN, or 0 for integers.
         """
         dtype = np.dtype(self.info.dtype)
 
         def counts(images: Tensor) -> Array:
             return scales.frames_to_counts(images, dtype, self.options.full_scale, self.info.nodata)
 
-        if result.restored and not result.indices:
+        def as_taken(index: int) -> Array:
+            frame = pixels[index - result.window.frames.start]
+            if isinstance(frame, str):
+                frame = np.full(self.info.shape[1:], np.nan if dtype.kind == "f" else 0, dtype)
+            if self.chosen.scale == 1 and self.chosen.mosaic is None:
+                return frame
+            return counts(self._unchanged(self._as_taken(frame[None]))[0])  # the shape of restored ones
+
+        if result.restored and not result.indices:  # one image of all frames
             frames = list(counts(result.frames))
-            return frames, self.record(result, len(frames))
-        written = list(result.window.written)
-        restored, frames = result.changed, []
-        for index in [written[len(written) // 2]] if self.chosen.joint is True else written:
-            if index in restored:
-                frames.append(counts(restored[index]))
-            elif self.options.bad_frames == "pass" or index not in result.bad_frames:
-                frame = pixels[index - result.window.frames.start]
-                if isinstance(frame, str):
-                    frame = np.full(self.info.shape[1:], np.nan if dtype.kind == "f" else 0, dtype)
-                if self.chosen.scale != 1 or self.chosen.mosaic is not None:  # the shape of restored ones
-                    frame = counts(self._unchanged(self._as_taken(frame[None]))[0])
-                frames.append(frame)
+        else:
+            restored, written = result.changed, list(result.window.written)
+            written = [written[len(written) // 2]] if self.chosen.joint is True else written
+            frames = [counts(restored[index]) if index in restored else as_taken(index) for index in written]
         return frames, self.record(result, len(frames))
 
     def record(self, result: WindowResult, written: int) -> WindowRecord:
@@ -250,12 +247,16 @@ class StackJob:
         followed = result.indices if isinstance(result.detection, FollowedVibration) else None
         verdict = None if restoration is None else restoration.verdict
         return WindowRecord(
-            **record_fields(verdict, result.bad_frames, result.detection, restored=result.restored),
             window=window.index,
             first=window.first,
             last=window.last,
             start_time=float(self.timing.frame_starts(window.first + 1)[-1]),
             written=written,
+            frames="restored" if result.restored else "as taken",
+            detection=None if result.detection is None else DetectedVibration.of(result.detection).to("cpu"),
+            outcome=None if verdict is None else verdict.overall,
+            predicted_gain=None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),
+            bad_frames={str(index): reason for index, reason in result.bad_frames.items()},
             left_alone=() if restoration is None else restoration.left_alone,
             error=result.error,
             followed=followed,
@@ -312,7 +313,7 @@ def _follows(options: ProcessStackOptions) -> bool | Literal["auto"]:
 
 def _given(
     options: ProcessStackOptions, info: StackInfo, timing: SensorTiming, windows: list[Window]
-) -> dict[int, DetectedVibration | FreeMotion | None] | None:
+) -> Sequence[DetectedVibration | FreeMotion | None] | None:
     """The given motion of every window, with the time origin at its first frame; None if none is given."""
     motion, given = options.motion, options.given
     if motion is None:
@@ -321,14 +322,14 @@ def _given(
                 f"given has {len(given)} detections for {len(windows)} windows of at most {options.window} frames; "
                 "pass one for each window"
             )
-        return None if given is None else dict(enumerate(given))
+        return given
     if options.detection or given is not None or not isinstance(motion, FreeMotion):
         raise ValueError("motion must be a FreeMotion; it has no detection, given detections or follow beside it")
     starts: list[float] = (timing.frame_starts(info.shape[0]) - timing.frame_starts(1)).tolist()
     readout = info.shape[int(timing.scan_axis)] * timing.row_time + timing.exposure_time
     ends = [(starts[window.first], starts[window.last]) for window in windows]
     parts = [motion.within(first - readout, last + 2 * readout).retimed(first) for first, last in ends]
-    return {window.index: part.to(options.device) for window, part in zip(windows, parts, strict=True)}
+    return [part.to(options.device) for part in parts]
 
 
 def plan_job(
@@ -367,74 +368,7 @@ def plan_job(
         most = 1
     else:
         most = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if stated.scheduler not in (None, "local"):  # the memory of other machines is not known
-        return job, windows, most
     at_once = windows_at_once(
         info, stated.window, memory=options.memory, most=most, restoration=restoration, on_gpu=on_gpu, margin=margin
     )
     return job, windows, at_once
-
-
-@checks_arguments
-def restore_block(
-    frames: Array,
-    timing: SensorTiming,
-    *,
-    detection: OptionTable = None,
-    restoration: OptionTable = None,
-    full_scale: float | None = None,
-    channels: Channels = None,
-    force: bool = False,
-    device: str = "cpu",
-) -> Array:
-    """Detect the vibration in a block of frames and restore them; the result has the shape and data type of the block.
-
-    For ``dask.array.map_overlap`` with an overlap of one frame, and similar tools. The time origin is the first frame
-    of the block. A block in which the detection fails is returned unchanged, as are frames that cannot be used.
-
-    Args:
-        frames: (T, H, W) or (T, C, H, W), as stored.
-        timing: The sensor; frames must be evenly spaced, because the position of the block in the stack is unknown.
-        detection: Options of ``detect_vibration``.
-        restoration: Options of ``restore``, for frames whose full scale is 1; not ``joint=True``.
-        full_scale: Count that corresponds to 1.0; 255 for ``uint8`` if not given, required for other integers.
-        channels: ``"last"`` for frames (T, H, W, C), as in ``detect_vibration``.
-        force: Whether to return restored frames even if they are judged worse than the raw ones.
-        device: Device for the computation.
-
-    Returns:
-        Restored frames.
-
-    Raises:
-        ValueError: If the timing has frame start times, ``joint=True``, the full scale is unknown, or the frames appear
-            to have their channels last.
-
-    Example:
-        >>> restored = array.map_overlap(  # doctest: +SKIP
-        ...     rsv.restore_block, depth={0: 1}, boundary="none", dtype=array.dtype, meta=array._meta,
-        ...     timing=timing, full_scale=4095,
-        ... )
-    """
-    if timing.frame_start_times is not None:
-        raise ValueError(
-            "timing must not have frame_start_times: the position of a block in the stack is unknown; use process_stack"
-        )
-    options = dict(restoration or {})
-    if options.get("joint") is True:
-        raise ValueError("joint=True makes one image of a block; restore_block keeps its shape")
-    for name in ("scale", "mosaic"):
-        if options.get(name) not in (None, 1):
-            raise ValueError(f"{name}={options[name]!r} changes the size of the frames; restore_block keeps it")
-    scales.check_dtype(frames.dtype)
-    axis = channel_axis("frames", frames.shape, channels)
-    stored = np.moveaxis(frames.astype(frames.dtype.newbyteorder("="), copy=False), axis, -3)
-    scale = scales.known_full_scale(frames.dtype, full_scale)
-    if frames.dtype.kind != "f":
-        scale = scales.required_full_scale(scale, frames.dtype, "frames")
-    info = StackInfo(stored.shape, stored.dtype.name, scale)
-    chosen = ProcessStackOptions(
-        detection=detection, restoration=options, full_scale=scale, force=force, device=device, follow=False
-    )
-    job = StackJob(Path("frames"), info, timing, chosen)
-    window, pixels = Window(0, 0, len(stored) - 1, len(stored)), list(stored)
-    return np.moveaxis(np.stack(job.stored(job.compute(window, pixels), pixels)[0]), -3, axis)

@@ -21,10 +21,8 @@ from rsvib_torch.motion.detected_vibration import DetectedVibration, FollowedVib
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.results.presentation import (
     AXIS_NAMES,
-    PHYSICAL_HEAD,
     Result,
     joined_columns,
-    physical_tone,
     plain_values,
 )
 from rsvib_torch.results.result_files import decode
@@ -60,7 +58,6 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
     settings: Table  # sensor and options
     versions: Table  # of the packages that computed it
     output: Table | None  # name of the output; None for detection only
-    bad_frames: dict[str, str]  # index of each frame that could not be used, with the reason
     windows: tuple[WindowRecord, ...]
     not_kept: tuple[str, ...] = ()  # metadata of the input that the output does not contain
     margins: dict[str, int] | None = None  # px that were cut off the sides of the frames of a video
@@ -133,6 +130,11 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
         return [start if frame is None or middle is None else middle for start, frame, middle in found]
 
     @property
+    def bad_frames(self) -> dict[str, str]:
+        """Index of each frame that could not be used, with the reason."""
+        return {index: reason for record in self.windows for index, reason in record.bad_frames.items()}
+
+    @property
     def shaking(self) -> dict[str, tuple[float, ...]] | None:
         """``rms_shaking`` of a video; None of a stack that was processed in windows."""
         return rms_shaking(record.shaking for record in self.windows) or None
@@ -161,11 +163,10 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
             "bad_frames": self.bad_frames,
         }
 
-    def tone_table(self, pixel_size: float | None = None) -> tuple[list[str], list[list[str]]]:
+    def tone_table(self) -> tuple[list[str], list[list[str]]]:
         """Head and rows of a table of the tones of each axis: median ± standard deviation over the windows.
 
-        Of a vibration that was followed, the amplitudes in the first and in the last frame. With the size of a pixel in
-        m, there are columns in units of length for x and y.
+        Of a vibration that was followed, the amplitudes in the first and in the last frame.
         """
         rows, count, unit = [], len(self.detections()), self._unit
         for name, of_axis in self.totals()["tones"].items():
@@ -176,21 +177,16 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
                 ]
                 if unit != "windows" and tone["windows"]:
                     texts[0] = f"{tone['first']:.4g} … {tone['last']:.4g}"
-                if pixel_size is not None:
-                    known = tone["windows"] and name in ("x", "y")
-                    physical = physical_tone(tone["amplitude"], tone["frequency"], pixel_size).values() if known else ()
-                    texts += [measured_text(value) for value in physical] or [""] * len(PHYSICAL_HEAD)
                 rows.append([name, f"{tone['windows']} of {count}", *texts])
-        head = ["axis", f"reliable {unit}", "amplitude (px)", "frequency (Hz)"]
-        return [*head, *(PHYSICAL_HEAD if pixel_size is not None else ())], rows
+        return ["axis", f"reliable {unit}", "amplitude (px)", "frequency (Hz)"], rows
 
-    def lines(self, pixel_size: float | None = None) -> tuple[list[str], list[str]]:
+    def lines(self) -> tuple[list[str], list[str]]:
         """The totals as lines of text: about the vibration, and about the restoration."""
         data = self.totals()
         spread = f"median ± standard deviation over the {self._unit}"
         if self._unit != "windows":
             spread = f"amplitude: in the first and the last frame; frequency: {spread}"
-        vibration = [text_table(*self.tone_table(pixel_size)), spread]
+        vibration = [text_table(*self.tone_table()), spread]
         followed = [record for record in self.windows if record.followed is not None]
         if followed and self.settings.get("follow") == "auto":
             which = "all" if len(followed) == len(self.windows) else f"{len(followed)} of {len(self.windows)}"
@@ -240,10 +236,6 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
                     number, why = next(iter(refused.items()))
                     text = f"{name} is restored as measured, but is not reliable in"
                     vibration.append(wrapped(f"{text} {number_of(len(refused), 'window')}; in window {number}: {why}"))
-        if data["errors"]:
-            window, error = next(iter(data["errors"].items()))
-            failed = f"detection or restoration failed in {number_of(len(data['errors']), 'window')}"
-            vibration.append(wrapped(f"{failed}; in window {window}: {error}"))
         return vibration, restoration
 
     @property
@@ -296,37 +288,33 @@ def _tones_over_windows(found: Sequence[DetectedVibration | None], axis: int) ->
 def fingerprint(path: Path) -> Table:
     """Name, size and hash of a file, with ``NAME.json`` beside it, or of a folder.
 
-    The hash covers the names and sizes of all files, and up to 32 evenly spaced blocks of 64 KiB of up to 32 of them,
-    the first and the last included: files of up to 2 MiB completely.
+    The hash covers the names and sizes of all files, and about 32 evenly spaced blocks of 64 KiB of about 32 of them:
+    files of up to 2 MiB completely.
     """
-
-    def spread(count: int) -> list[int]:
-        return sorted(set(np.linspace(0, count - 1, min(count, 32)).round().astype(int).tolist()))
-
     name, (path, _) = path.name, split_range(path)
     members = path.rglob("*") if path.is_dir() else (path, path.with_name(f"{path.name}.json"))
     files = sorted(file for file in members if file.is_file())
     sizes = [file.stat().st_size for file in files]
     digest, block = hashlib.sha256(), 1 << 16
-    for file, size in zip(files, sizes, strict=True):
+    for number, (file, size) in enumerate(zip(files, sizes, strict=True)):
         digest.update(os.fsencode(file.relative_to(path.parent)) + f"\0{size}\0".encode())
-    for number in spread(len(files)):
-        with files[number].open("rb") as opened:
-            for index in spread(-(-sizes[number] // block)):
-                opened.seek(index * block)
-                digest.update(opened.read(block))
+        if number % -(-len(files) // 32) == 0:
+            with file.open("rb") as opened:
+                for begin in range(0, size, max(block, size // 32)):
+                    opened.seek(begin)
+                    digest.update(opened.read(block))
     return {"name": name, "bytes": sum(sizes), "sha256_of_samples": digest.hexdigest()}
 
 
 # options on which the result depends
-_SETTINGS = ("full_scale", "window", "follow", "detection", "restoration", "bad_frames", "force", "device")
+_SETTINGS = ("full_scale", "window", "follow", "detection", "restoration", "force", "device")
 
 
 def manifest_header(job: StackJob, output: str | None, compression: str | None) -> Table:
     """Everything on which the result depends, for JSON: a run is resumed only if it is unchanged."""
     given = None
     if job.given is not None:
-        plain = [DetectedVibration.of(one) if isinstance(one, DetectedVibration) else one for one in job.given.values()]
+        plain = [DetectedVibration.of(one) if isinstance(one, DetectedVibration) else one for one in job.given]
         given = hashlib.sha256(json.dumps(plain_values(plain)).encode()).hexdigest()
     options = {name: getattr(job.options, name) for name in _SETTINGS}
     options["device"] = job.options.device.partition(":")[0]
@@ -336,13 +324,6 @@ def manifest_header(job: StackJob, output: str | None, compression: str | None) 
         "versions": {name: version(name) for name in ("rsvib_torch", "torch", "numpy")},
         "output": None if output is None else {"name": output, "compression": compression},
     }
-
-
-def stack_manifest(header: Table, records: Iterable[WindowRecord]) -> StackManifest:
-    """The manifest of a run, from its header and the records of all windows."""
-    windows = tuple(records)
-    bad = {index: reason for record in windows for index, reason in record.bad_frames.items()}
-    return StackManifest(**header, bad_frames=bad, windows=windows)
 
 
 @checks_arguments

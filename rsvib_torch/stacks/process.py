@@ -4,10 +4,13 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
+import torch
 
 from rsvib_torch.checks.arrays import PathLike
+from rsvib_torch.execution.parallel import in_threads
 from rsvib_torch.files.atomic import check_outputs, check_writable
 from rsvib_torch.files.reading import Table
 from rsvib_torch.frames.entry_points import file_options, source_options
@@ -15,12 +18,13 @@ from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, s
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import DetectStackOptions, ProcessStackOptions, Progress, StackOptions
-from rsvib_torch.stacks.engines import compute_here, compute_with_dask
-from rsvib_torch.stacks.job import StoredWindow, WindowFrames, WindowResult, plan_job
-from rsvib_torch.stacks.manifest import manifest_header, stack_manifest
+from rsvib_torch.stacks.job import StackJob, StoredWindow, WindowFrames, WindowResult, plan_job, read_windows
+from rsvib_torch.stacks.manifest import StackManifest, manifest_header
+from rsvib_torch.stacks.memory import share_one_heap
 from rsvib_torch.stacks.run_folder import RunFolder, StackReport, check_space, run_to_file
 from rsvib_torch.stacks.windows import Window
 
+_Result = TypeVar("_Result")
 _UNCOMPRESSED = ("npy", "hdf5", "raw", "tiff")  # formats whose files have the size of their pixels
 _MAX_INITIAL_FAILURES = 8  # windows; a run stops if all windows up to this number fail
 
@@ -51,7 +55,7 @@ def iterate_stack(source: PathLike, timing: SensorTiming, options: StackOptions)
         (1, 2, 3) [110.0, 90.0]
     """
     job, windows, at_once = plan_job(source, timing, options)
-    yield from compute_here(job, windows, lambda result, _: result, at_once=at_once)
+    yield from _computed(job, windows, lambda result, _: result, at_once=at_once)
 
 
 @file_options(DetectStackOptions)
@@ -70,9 +74,9 @@ def detect_stack(source: PathLike, sink: PathLike, timing: SensorTiming, options
     job, windows, at_once = plan_job(source, timing, options)
     check_outputs([sink], stack_files(source))
     check_writable(Path(sink))
-    results = compute_here(job, windows, lambda result, _: (list[Array](), job.record(result, 0)), at_once=at_once)
+    results = _computed(job, windows, lambda result, _: (list[Array](), job.record(result, 0)), at_once=at_once)
     records = (record for _, record in _watched(results, windows, windows, [], options.progress))
-    stack_manifest(manifest_header(job, None, None), records).save(sink)
+    StackManifest(**manifest_header(job, None, None), windows=tuple(records)).save(sink)
 
 
 @file_options(ProcessStackOptions)
@@ -80,7 +84,7 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
     """Restore a stack of any length from file to file.
 
     The stack is cut into windows as in ``iterate_stack``. They depend only on the number of frames and ``window``, and
-    each is computed on one thread: results do not depend on memory, workers and scheduler. The output gets its name
+    each is computed on one thread: results do not depend on memory and workers. The output gets its name
     when it is complete; until then it is stored in the folder ``.NAME.rsvib`` beside it, from which an interrupted run
     can be resumed. Memory does not grow with the number of frames.
 
@@ -136,21 +140,16 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
         return job.stored(result, pixels)
 
     def compute(folder: RunFolder) -> Table:
-        nonlocal out
         remaining = [window for window in windows if window.index not in folder]
         count = len(remaining) if joined else sum(window.kept for window in remaining)
         # the finished windows and the output are on the disk together, until the output is complete
         count += out.shape[0] if compression is None and form.name in _UNCOMPRESSED else 0
         check_space(sink, count * out.frame_bytes)
-        if options.scheduler is None:
-            results = compute_here(job, remaining, finish, at_once=at_once)
-        else:
-            results = compute_with_dask(job, remaining, scheduler=options.scheduler, workers=at_once)
+        results = _computed(job, remaining, finish, at_once=at_once)
         errors = [record.error for record in folder.records()]
         for frames, record in _watched(results, windows, remaining, errors, options.progress, folder.remove):
             # channels may be stored last
             folder.add(record, array=np.ascontiguousarray(np.stack(frames)) if frames else None)
-        out = out.with_frames(sum(record.written for record in folder.records()))
         return {"not_kept": metadata_not_kept(job.info, sink, out.shape)}
 
     def stored(folder: RunFolder) -> Iterator[Array]:
@@ -170,6 +169,20 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
         write=write,
     )
     return replace(report, first=first)
+
+
+def _computed(
+    job: StackJob, windows: Sequence[Window], finish: Callable[[WindowResult, WindowFrames], _Result], *, at_once: int
+) -> Generator[_Result, None, None]:
+    """Compute windows, in order; ``finish`` gets a result and its frames in the thread that computed it."""
+
+    def compute(window: Window, pixels: WindowFrames) -> _Result:
+        return finish(job.compute(window, pixels), pixels)
+
+    share_one_heap()
+    # Sums of floats depend on the number of threads: results must not depend on how many windows are computed at once.
+    threads = torch.get_num_threads() if all(window.alone for window in windows) else 1
+    return in_threads(compute, read_windows(job, windows), at_once=at_once, threads=threads)
 
 
 def _watched(

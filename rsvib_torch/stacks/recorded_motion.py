@@ -134,43 +134,37 @@ def _aligned_runs(
     starts = timing.frame_starts(info.shape[0])
     readout = info.shape[int(timing.scan_axis)] * timing.row_time + timing.exposure_time
     limits = offset_range(recorded.start, recorded.end, 0.0, float(starts[-1] - starts[0]) + readout, offsets)
-    order = [runs[len(runs) // 2], *runs[: len(runs) // 2], *runs[len(runs) // 2 + 1 :]]
     found: list[ClockAlignment] = []
     middles: list[float] = []
-    for run in order:
+    for run in sorted(runs, key=lambda run: abs(run.start - runs[len(runs) // 2].start)):
         frames, of_run = part_of_stack(source, info, timing, run)
         middles.append(0.5 * float(starts[run.start] + starts[run.stop - 1] - 2 * starts[0]) + 0.5 * readout)
         near = limits
         if found:
             error = _CLOCK_ERROR * abs(middles[-1] - middles[0]) + 4 * found[0].offset_std
             near = max(limits[0], found[0].offset - error), min(limits[1], found[0].offset + error)
-        one = align(frames, of_run, recorded, offsets=near, fit_scale=False)
-        found.append(one)
-        if not one.reliable:  # the others cannot make it reliable
-            return one
+        found.append(align(frames, of_run, recorded, offsets=near, fit_scale=False))
+        if not found[-1].reliable:  # the others cannot make it reliable
+            return found[-1]
     # 2. A straight line through the readings.
     times, readings = np.array(middles), np.array([one.offset for one in found])  # s; less the times of the frames
-    weights = 1 / np.array([one.offset_std for one in found])
-    line, covariance = np.polyfit(times - times.mean(), readings, 1, w=weights, cov="unscaled")
-    rest = float(np.square((readings - np.polyval(line, times - times.mean())) * weights).sum())  # 1 degree of freedom
+    weights, middle = 1 / np.array([one.offset_std for one in found]), float(np.mean(middles))
+    line, covariance = np.polyfit(times - middle, readings, 1, w=weights, cov="unscaled")
+    rest = float(np.square((readings - np.polyval(line, times - middle)) * weights).sum())  # 1 degree of freedom
     covariance *= max(1.0, rest)
-    scale, gradient = 1.0 + float(line[0]), np.array([-times.mean(), 1.0])
+    scale, gradient = 1.0 + float(line[0]), np.array([-middle, 1.0])
     offset, offset_std = float(gradient @ line), math.sqrt(gradient @ covariance @ gradient)
-    # 3. The motion with the mean gain and drift.
-    gain_x, gain_y = np.mean([one.gain for one in found], 0).tolist()
-    drift = torch.stack([one.drift for one in found]).mean(0)
-    middle = float(times.mean())
-    clock = FittedClock(offset + scale * middle, scale, (gain_x, gain_y), tuple(drift.tolist()), middle)
-    findings = outside(offset, offset_std, offsets)
-    return ClockAlignment(
+    # 3. The motion with the gain and drift in the middle of the stack.
+    gain, drift = found[0].gain, found[0].drift
+    clock = FittedClock(offset + scale * middle, scale, gain, tuple(drift.tolist()), middle)
+    findings = tuple(outside(offset, offset_std, offsets))
+    return replace(
+        found[0],
         motion=clock.motion(recorded),
         offset=offset,
         offset_std=offset_std,
         scale=scale,
         scale_std=math.sqrt(covariance[0, 0]),
-        gain=(gain_x, gain_y),
-        drift=drift,
-        unexplained=torch.stack([one.unexplained for one in found]).square().mean(0).sqrt(),
         reliable=not findings,
-        findings=tuple(findings),
+        findings=findings,
     )

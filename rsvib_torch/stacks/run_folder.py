@@ -38,7 +38,7 @@ from rsvib_torch.options import RunOptions
 from rsvib_torch.results.presentation import Summarised, plain_values
 from rsvib_torch.results.result_files import decode
 from rsvib_torch.stacks.job import WindowResult
-from rsvib_torch.stacks.manifest import StackManifest, read_manifest, stack_manifest
+from rsvib_torch.stacks.manifest import StackManifest, read_manifest
 from rsvib_torch.stacks.windows import WindowRecord
 from rsvib_torch.text import number_of, one_line
 
@@ -346,7 +346,7 @@ def run_to_file(
         resumed = len(folder.records())
         results = compute(folder)
         atomic.make_folder(path.parent)
-        manifest = stack_manifest({**header, **results}, folder.records())
+        manifest = StackManifest(**header, **results, windows=tuple(folder.records()))
         with atomic.whole_file(path) as part:
             manifest.save(part)
             write(folder)

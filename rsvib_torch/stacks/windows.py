@@ -1,18 +1,14 @@
 """Windows: consecutive frames that are processed together, and the records of their results."""
 
 import itertools
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
 
 from rsvib_torch.checks.values import check_whole_number
-from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.restoration import RestorationVerdict
-from rsvib_torch.results.presentation import plain_values
 from rsvib_torch.results.reason import Reason
 
 
@@ -86,34 +82,15 @@ class WindowRecord:
     start_time: float  # s, exposure start of its first row, the time origin of its detection
     written: int  # number of frames written
     frames: Literal["restored", "as taken"]  # those that are written
-    detection: DetectedVibration | None  # None if it failed; of a window that was followed, a batch of its frames
-    left_alone: tuple[Reason, ...]  # a reason for each axis that was not restored
-    outcome: str | None  # ``RestorationVerdict.overall``; None if the frames could not be compared
-    summary: str | None  # ``RestorationVerdict.sentence``
-    predicted_gain: float | None  # dB, mean of ``RestorationVerdict.predicted_gain``; None if unknown
-    error: str | None  # why detection or restoration failed
-    bad_frames: dict[str, str]  # index of each frame that could not be used, with the reason
+    detection: DetectedVibration | None = None  # None: it failed; of a followed window, a batch of its frames
+    left_alone: tuple[Reason, ...] = ()  # a reason for each axis that was not restored
+    outcome: str | None = None  # ``RestorationVerdict.overall``; None if the frames could not be compared
+    predicted_gain: float | None = None  # dB, mean of ``RestorationVerdict.predicted_gain``; None if unknown
+    error: str | None = None  # why detection or restoration failed
+    bad_frames: dict[str, str] = field(default_factory=dict)  # index of each that could not be used, with the reason
     # Of a part of a video, rms motion in px before and after, in its first frames: ``frame_to_frame``, changes of the
     # motion of the frame, and ``rows``, of twelfths of the rows beside it. None: not measured.
     shaking: dict[str, tuple[float, ...]] | None = None
     # of a window that was followed: the frames of its detection, and those that are restored
     followed: tuple[int, ...] | None = None
     restored_frames: int | None = None
-
-
-def record_fields(
-    verdict: RestorationVerdict | None,
-    bad_frames: Mapping[int, str],
-    detection: DetectedVibration | None,
-    *,
-    restored: bool,
-) -> Table:
-    """Fields of a record from a verdict and a detection."""
-    return {
-        "frames": "restored" if restored else "as taken",
-        "detection": None if detection is None else DetectedVibration.of(detection).to("cpu"),
-        "outcome": None if verdict is None else verdict.overall,
-        "summary": None if verdict is None else verdict.sentence,
-        "predicted_gain": None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),
-        "bad_frames": {str(index): reason for index, reason in bad_frames.items()},
-    }

@@ -1,8 +1,8 @@
-from .frame_outputs import FrameOutput, PageOutput, PipeOutput, VideoOutput
+from .frame_outputs import FrameOutput, PipeOutput, VideoOutput
+from .margins import Margins
 from .process_video import process_video
 from .session import LiveReport, run_live
 from .sources import CameraSource, FileSource, FrameSource, PipeSource, TimedFrame
-from .video_border import Margins, VideoBorder
 
 __all__ = [
     "CameraSource",
@@ -11,11 +11,9 @@ __all__ = [
     "FrameSource",
     "LiveReport",
     "Margins",
-    "PageOutput",
     "PipeOutput",
     "PipeSource",
     "TimedFrame",
-    "VideoBorder",
     "VideoOutput",
     "process_video",
     "run_live",

@@ -1,14 +1,10 @@
-"""Outputs of video frames: files, pipes, and a page for browsers on this machine."""
+"""Outputs of video frames: files and pipes."""
 
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from functools import cached_property
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Protocol
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,15 +22,6 @@ Frame = NDArray[np.uint8]  # (H, W) grey or (H, W, 3) RGB
 # After a kill, 2 of 100 frames are missing in .mp4 and 1 in .mkv; with the defaults, .mp4 cannot be read
 _FRAGMENTS = {"flush_packets": "1", "movflags": "frag_every_frame+empty_moov+default_base_moof"}
 _CLUSTERS = {"flush_packets": "1", "cluster_time_limit": "0"}  # ms
-_HOST = "127.0.0.1"  # never reachable from other machines
-# the next frame is requested when one is shown: a slow browser gets fewer of them
-_PAGE = """<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>rsvib live</title>
-<style>body{font-family:sans-serif;margin:1em}img{max-width:100%}pre{background:#f4f4f4;padding:.6em}</style>
-</head><body><h1>rsvib live</h1><img id="frame" alt="restored frames"><pre id="state"></pre>
-<script>const image = document.getElementById("frame"), text = document.getElementById("state");
-const next = () => {image.src = "/frame?" + Date.now()};
-image.onload = () => setTimeout(next, 20); image.onerror = () => setTimeout(next, 500); next();
-setInterval(async () => {text.textContent = await (await fetch("/state")).text()}, 500)</script></body></html>"""
 
 
 class FrameOutput(Protocol):
@@ -120,76 +107,3 @@ class VideoOutput:
                 self._encoder.finish()
             self._container.close()
             sync(self._path)
-
-
-class _PageFrame:
-    """A frame of the page, which is encoded at its first request only."""
-
-    def __init__(self, frame: Frame) -> None:
-        self._frame = frame
-
-    @cached_property
-    def jpeg(self) -> bytes:
-        """The frame in a JPEG file."""
-        colours = self._frame if self._frame.ndim == 2 else np.ascontiguousarray(self._frame[..., ::-1])
-        return cv2.imencode(".jpg", colours, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
-
-
-class PageOutput:
-    """Restored frames at ``http://127.0.0.1:PORT``; the port 0 chooses a free one. ``url`` is the address."""
-
-    def __init__(self, port: int) -> None:
-        self._frame: _PageFrame | None = None  # the last one
-        self._state = "waiting for frames"
-        output = self
-
-        class Handler(BaseHTTPRequestHandler):
-            """Answers of the page."""
-
-            timeout = 10.0  # s, without a byte; connections that are never used would keep a thread each
-
-            def do_GET(self) -> None:
-                """Answer a request."""
-                name = self.path.partition("?")[0]
-                if self.headers.get("Host", "").rpartition(":")[0] not in (_HOST, "localhost"):
-                    self.send_error(403, f"the page is at {output.url}")  # another site refers to this machine
-                elif name == "/":
-                    self._send("text/html; charset=utf-8", _PAGE.encode())
-                elif name == "/state":
-                    self._send("text/plain; charset=utf-8", output._state.encode())
-                elif name == "/frame" and output._frame is not None:
-                    self._send("image/jpeg", output._frame.jpeg)
-                else:
-                    self.send_error(404)
-
-            def _send(self, kind: str, data: bytes) -> None:
-                self.send_response(200)
-                self.send_header("Content-Type", kind)
-                self.send_header("Content-Length", str(len(data)))
-                self.end_headers()
-                with suppress(OSError):  # the browser has left
-                    self.wfile.write(data)
-
-            def log_message(self, *_: object) -> None:
-                """Requests are not printed."""
-
-        try:
-            self._server = ThreadingHTTPServer((_HOST, port), Handler)
-        except (OSError, OverflowError) as error:
-            raise OSError(f"--page {port}: {error}; choose another port") from error
-        self._server.daemon_threads = True
-        self.url = f"http://{_HOST}:{self._server.server_address[1]}/"
-        threading.Thread(target=self._server.serve_forever, name="rsvib-page", daemon=True).start()
-
-    def show_state(self, text: str) -> None:
-        """Show a text below the frames."""
-        self._state = text
-
-    def write(self, frame: Frame, index: int) -> None:
-        """Show a frame."""
-        self._frame = _PageFrame(frame)
-
-    def close(self) -> None:
-        """End the page."""
-        self._server.shutdown()
-        self._server.server_close()

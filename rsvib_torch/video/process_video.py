@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from rsvib_torch.checks.arrays import PathLike
 from rsvib_torch.checks.validation import fields_of
@@ -27,27 +26,22 @@ from rsvib_torch.io.video import CONTAINERS, VideoReader, join_parts, part_of_vi
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import ProcessVideoOptions, ResourceOptions, StackOptions
-from rsvib_torch.restoration import RestorationVerdict
 from rsvib_torch.results.presentation import plain_values
-from rsvib_torch.stacks.heap import share_one_heap
 from rsvib_torch.stacks.job import plan_job, single_frame_options
 from rsvib_torch.stacks.manifest import fingerprint, manifest_header, rms_shaking
+from rsvib_torch.stacks.memory import share_one_heap
 from rsvib_torch.stacks.run_folder import RunFolder, StackReport, run_to_file
 from rsvib_torch.video import Margins
 from rsvib_torch.video.video_frames import Frame, FrameTrack, VideoFrames
-from rsvib_torch.video.video_passes import PART_FRAMES, VideoMotion, VideoPasses
+from rsvib_torch.video.video_passes import PART_FRAMES, VideoMotion, VideoPasses, shakes_more
 
-# A video that shakes more is refused: wrong settings make it 1.5 to 5 times as shaky. 0.1 px is not visible.
-_MORE_SHAKING, _VISIBLE_SHAKING = 1.1, 0.1  # -, px
-
-_JUDGED_FRAMES = 4  # of each part, two neighbouring ones of which are judged
+_JUDGED_FRAMES = 4  # of each part, whose shaking decides whether it is restored
 
 # What the manifest states of the alignment of a gyroscope.
 _OF_GYROSCOPE = ("orientation", "offset", "offset_std", "scale", "bias", "focal_length", "focal_length_std")
 
 Planes = list[Frame]
-# what was removed from a frame, and ``VideoFrames.restored`` of it; None if it cannot be read
-_Restored = tuple[FrameTrack, Planes | None, list[NDArray[np.bool_]] | None]
+_Restored = tuple[FrameTrack, Planes | None]  # what was removed from a frame, and its planes; None: it cannot be read
 
 
 @file_options(ProcessVideoOptions)
@@ -68,12 +62,11 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
 
     Tones that sweep are followed in windows of 24 frames, where others leave more than 0.3 px.
 
-    Two frames of each part of 32 are judged. Of a part that is worse, or that path and tones do not explain, and that
-    shakes more than as taken, rows are not moved apart: no vibration, and with ``steady`` no wobble, is undone; if it
-    shakes less, it has no verdict. Frames that cannot be decoded and constant frames are replaced by the frame before;
-    copies of the frame before are moved along the smooth path. The video is encoded in parts in the folder
-    ``.NAME.rsvib`` beside it, from which an interrupted run is resumed. A video whose corners shake more in the
-    restored frames than in those of the input is not written.
+    Of a part of 32 frames whose first ones would shake more than as taken, rows are not moved apart: no vibration, and
+    with ``steady`` no wobble, is undone. Frames that cannot be decoded and constant frames are replaced by the frame
+    before (at the beginning of a part by the one behind them); copies of the frame before are moved along the smooth
+    path. The video is encoded in parts in the folder ``.NAME.rsvib`` beside it, from which an interrupted run is
+    resumed. A video whose corners shake more in the restored frames than in those of the input is not written.
 
     Args:
         source: A video, or another stack as in ``read_stack``.
@@ -152,7 +145,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
 
     def write(folder: RunFolder) -> None:
         with whole_file(sink) as part:
-            join_parts(part, content, (folder.open(name) for name in folder.files() if not name.endswith(".npy")))
+            join_parts(part, content, map(folder.open, folder.files()))
 
     return run_to_file(
         sink,
@@ -178,7 +171,7 @@ def _check_shaking(folder: RunFolder, *, is_explained: bool) -> None:
             "shaking of the restored video cannot be measured"
         )
     for key, (before, after) in shaking.items():
-        if after > _MORE_SHAKING * before + _VISIBLE_SHAKING:
+        if shakes_more(before, after):
             folder.remove()
             raise ValueError(
                 f"the restored video would shake more than the input: {after:.2g} px {names[key]}, {before:.2g} px "
@@ -197,7 +190,7 @@ def _planned(
     with closing(open_stack(source)) as reader:
         stored = reader.picture if isinstance(reader, VideoReader) else None
     picture = stored if stored is not None and stored.fits(sink.suffix.lower()) else None
-    frames = VideoFrames(job, picture, masks=options.border != "mirror")
+    frames = VideoFrames(job, picture)
     if job.info.shape[0] < 3:
         raise ValueError(
             f"{source}: to be followed, a video needs at least 3 frames, it has {job.info.shape[0]}; use process_stack "
@@ -231,7 +224,7 @@ class _SecondPass:
     info: StackInfo  # of the video to write
     margins: Margins | None  # which are cut off
     progress: Callable[[], None]
-    verdicts: dict[int, RestorationVerdict | None] = field(default_factory=dict)  # on the parts
+    worse: set[int] = field(default_factory=set)  # parts that are left alone
 
     def run(self, at_once: int) -> None:
         """Restore a number of frames at the same time."""
@@ -252,42 +245,35 @@ class _SecondPass:
                     continue
                 tracked = ((video.track(motion, index), frame) for index, frame in frames)
                 first = list(islice(tracked, _JUDGED_FRAMES))
-                verdict = video.verdict(motion, first)
-                # Parallax and overlays make two frames worse that shake less: corners decide.
-                contradicts = verdict is not None and verdict.overall == "worse"
-                is_doubted = contradicts or not video.is_explained(motion, part)
-                is_worse = is_doubted and video.shakes_more(motion, [track for track, _ in first])
-                self.verdicts[part] = None if is_doubted and not is_worse else verdict
+                if video.is_worse(motion, part, [track for track, _ in first]):
+                    self.worse.add(part)
                 for track, frame in chain(first, tracked):
-                    yield video.left_alone(track) if is_worse else track, frame
+                    yield video.left_alone(track) if part in self.worse else track, frame
 
     def _restored(self, track: FrameTrack, frame: Frame | str) -> _Restored:
-        return (track, None, None) if isinstance(frame, str) else (track, *self.video.frames.restored(frame, track))
+        return track, None if isinstance(frame, str) else self.video.frames.restored(frame, track)
 
     def _encode(self, part: int, frames: Iterator[_Restored]) -> None:
-        """Encode the frames of a part, and enter it in the folder with the frame that it ends with."""
+        """Encode the frames of a part, and enter it in the folder."""
         layout, folder = self.video.frames, self.folder
         name = f"{part:06d}{folder.sink.suffix.lower()}"
         tracks: list[FrameTrack] = []
-        before: Planes | None = None  # the frame before, without margins cut off
-        if part > 0:
-            with folder.open(f"{part - 1:06d}.npy") as file:
-                before = layout.planes(np.load(file, allow_pickle=False))
+        shown: Frame | None = None  # the last frame that could be used
         with part_of_video(folder.create(name), folder.sink, self.info, layout.picture) as write:
-            for track, planes, visible in frames:
+            for track, planes in frames:
                 if tracks:
                     self.progress()  # the frame before is complete
-                if planes is None or (track.fault is not None and before is not None):
-                    before = layout.black() if before is None else before
-                elif visible is None or before is None:  # nothing is hidden, or it is mirrored
-                    before = planes
-                else:  # hidden pixels are held
-                    before = [np.where(*one) for one in zip(visible, planes, before, strict=True)]
-                write(layout.frame(_cut(before, self.margins)))
+                if planes is not None and track.fault is None:
+                    is_first, shown = shown is None, layout.frame(_cut(planes, self.margins))
+                    for _ in range(len(tracks) if is_first else 0):  # those before it could not be used
+                        write(shown)
+                if shown is not None:
+                    write(shown)
                 tracks.append(track)
-        assert before is not None
-        record = self.video.record(part, tracks, self.motion, self.verdicts[part])
-        folder.add(record, [name], np.ascontiguousarray(layout.frame(before)))
+            if shown is None:
+                for _ in tracks:
+                    write(layout.frame(_cut(layout.black(), self.margins)))
+        folder.add(self.video.record(part, tracks, self.motion, is_worse=part in self.worse), [name])
         self.progress()
 
 
@@ -295,8 +281,6 @@ def _cut(planes: Planes, margins: Margins | None) -> Planes:
     """Planes without margins; those of chroma are half as wide."""
     if margins is None:
         return planes
-    first, *others = planes
-    luma = margins.cut(first)
-    rows, columns = luma.shape[-2] // 2, luma.shape[-1] // 2  # even, as the margins are, see ``VideoFrames.margins``
-    top, left = margins.top // 2, margins.left // 2
-    return [luma, *(plane[..., top : top + rows, left : left + columns] for plane in others)]
+    luma, top, left = margins.cut(planes[0]), margins.top // 2, margins.left // 2
+    rows, columns = luma.shape[-2] // 2, luma.shape[-1] // 2
+    return [luma, *(chroma[..., top : top + rows, left : left + columns] for chroma in planes[1:])]

@@ -17,7 +17,6 @@ from rsvib_torch.detection import DetectionResult
 from rsvib_torch.execution.parallel import prefetched
 from rsvib_torch.io.full_scale import frames_to_counts
 from rsvib_torch.tracking import TrackedFrame, VibrationTracker
-from rsvib_torch.video import VideoBorder
 from rsvib_torch.video.frame_outputs import FrameOutput
 from rsvib_torch.video.sources import FrameReader, FrameSource
 
@@ -59,9 +58,7 @@ def run_live(
     tracker: VibrationTracker,
     outputs: Sequence[FrameOutput],
     *,
-    border: VideoBorder | None = None,
     drops: bool = True,
-    waiting: int = 64,
     max_frames: int | None = None,
     progress: Callable[[TrackedFrame, LiveReport], None] | None = None,
 ) -> LiveReport:
@@ -74,10 +71,8 @@ def run_live(
         tracker: The tracker.
         outputs: They get frames of 8 bits, (H, W) or (H, W, 3), and are closed at the end. The session ends if the
             program behind a pipe does.
-        border: Treatment of pixels that the sensor did not record.
         drops: Whether the source must not wait. If processing is too slow, the motion of late frames is then predicted
-            instead of measured, and beyond ``waiting`` frames the oldest are dropped.
-        waiting: Largest number of frames that wait.
+            instead of measured, and beyond 64 waiting frames the oldest are dropped.
         max_frames: Number of frames to process; None for all.
         progress: Called for every tracked frame.
 
@@ -89,8 +84,8 @@ def run_live(
             source or the tracker.
     """
     report, begin, threads = LiveReport(), time.perf_counter(), torch.get_num_threads()
-    border, period = border or VideoBorder("mirror"), tracker.timing.frame_period
-    reader, last, index = FrameReader(source, waiting, drops=drops), None, -1
+    period = tracker.timing.frame_period
+    reader, last, index = FrameReader(source, drops=drops), None, -1
 
     with ExitStack() as ending:  # from the last line to the first
         ending.callback(torch.set_num_threads, threads)
@@ -110,7 +105,7 @@ def run_live(
         for tracked, arrived in tracked_frames:
             if progress is not None:
                 progress(tracked, report)
-            frame, index = to_counts(border(tracked)), max(index + 1, round(tracked.time / period))
+            frame, index = to_counts(tracked.restored), max(index + 1, round(tracked.time / period))
             for output in outputs:
                 output.write(frame, index)
             last = tracked

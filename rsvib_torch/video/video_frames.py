@@ -1,4 +1,4 @@
-"""Restoration of one frame of a video: its planes, the pixels that the sensor did not record, and margins.
+"""Restoration of one frame of a video: its planes.
 
 Invariant: the displacement depends on the row only (docs/architecture.md); with roll and zoom also linearly on the
 column.
@@ -27,7 +27,6 @@ from rsvib_torch.numerics.splines import mirrored
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.restoration.restore import WITH_SATURATION, restore_prepared
 from rsvib_torch.stacks.job import StackJob
-from rsvib_torch.video import Margins
 
 _LOBES = 4  # of the kernel of Lanczos on each side
 # of pixels, or of Y and chroma: Y has 44.8 dB with Lanczos and 44.5 dB with the cubic kernel, chroma 46.9 and 47.0 dB
@@ -57,7 +56,6 @@ class VideoFrames:
 
     job: StackJob  # source and settings
     picture: Picture | None  # if frames are the planes Y, U and V of a 4:2:0 video (``VideoReader.planes``)
-    masks: bool  # whether to determine which pixels the sensor recorded
 
     @property
     def planar(self) -> bool:
@@ -74,13 +72,9 @@ class VideoFrames:
         """Count that corresponds to 1.0; None for floats."""
         return self.job.options.full_scale if self.picture is None else 255.0
 
-    def luma(self, frame: Frame) -> Frame:
-        """The part of a frame in which motion is measured."""
-        return frame[: self.size[0]] if self.planar else frame
-
     def grey(self, frame: Frame) -> NDArray[np.uint8]:
         """The frame as 8-bit counts (H, W), in which corners are followed."""
-        luma: Array = self.luma(frame)
+        luma: Array = self.planes(frame)[0]
         luma = luma if luma.ndim == 2 else luma.mean(0)
         if luma.dtype == np.uint8:
             return luma.astype(np.uint8, copy=False)
@@ -106,22 +100,12 @@ class VideoFrames:
         height, width = self.size
         return [np.full((height, width), 16, np.uint8), np.full((2, height // 2, width // 2), 128, np.uint8)]
 
-    def margins(self, margins: Margins) -> Margins:
-        """The margins, widened to whole pixels of every plane."""
-        if not self.planar:
-            return margins
-        return Margins(*(side + side % 2 for side in (margins.top, margins.bottom, margins.left, margins.right)))
-
-    def restored(self, frame: Frame, track: FrameTrack) -> tuple[list[Frame], list[NDArray[np.bool_]] | None]:
-        """Planes of a restored frame, as taken if it could not be used, and of each the pixels (H, W) that are visible.
-
-        These are those that the sensor recorded; None: all, or they were not determined.
-        """
+    def restored(self, frame: Frame, track: FrameTrack) -> list[Frame]:
+        """Planes of a restored frame, as taken if it could not be used."""
         planes, method = self.planes(frame), self.job.chosen.method
         if track.fault is not None or not bool(track.motion.moving_axes().any()):
-            return planes, None
+            return planes
         results: list[Frame] = []
-        visible: list[NDArray[np.bool_]] = []
         for number, plane in enumerate(planes):
             motion = track.motion if number == 0 else _on_half_pixels(track.motion)
             timing = self.timing_of(number, track.exposure)
@@ -135,17 +119,12 @@ class VideoFrames:
                     values[:2] = 0.0
                 motion = replace(motion, amplitude=torch.zeros_like(motion.amplitude), **rest)
             offsets, weights = recorded_offsets(motion, timing, plane.shape[-2:])
-            is_rowwise = len(weights) == 1  # all columns are displaced alike
-            if self.masks or not is_rowwise:
-                source = places(offsets, weights, timing, plane.shape[-2:])
-            if is_rowwise:
+            if len(weights) == 1:  # all columns are displaced alike
                 results.append(_with_rows_moved(plane, offsets[..., 0], rows_first=timing.scan_axis == -2))
             else:
+                source = places(offsets, weights, timing, plane.shape[-2:])
                 results.append(_with_pixels_moved(plane, source, _KERNELS[number]))
-            if self.masks:
-                limits = np.array(plane.shape[:-3:-1], dtype=np.float32)[:, None, None] - 1
-                visible.append(np.all((source >= 0) & (source <= limits), axis=0))
-        return results, visible if self.masks else None
+        return results
 
     def timing_of(self, plane: int, exposure: float | None = None) -> SensorTiming:
         """Timing of one frame, with the time origin in its middle; rows of chroma lie between two of luma."""

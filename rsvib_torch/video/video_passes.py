@@ -18,23 +18,20 @@ from rsvib_torch.execution.parallel import ONE_BLAS_THREAD, prefetched
 from rsvib_torch.gyroscope.corner_tracks import followed_pair, tracks_of_pairs
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
 from rsvib_torch.gyroscope.rotation_alignment import AlignOptions, RotationAlignment, align_rates
-from rsvib_torch.io.full_scale import counts_to_frames
 from rsvib_torch.io.video import VideoReader
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.sampling import places_at_rest, recorded_offsets
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
-from rsvib_torch.numerics.tables import Array, tensor
+from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import ProcessVideoOptions
 from rsvib_torch.registration.corners import CornerFollower, Corners, reduction
-from rsvib_torch.restoration import RestorationVerdict
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
 from rsvib_torch.stacks.job import stored_frame
 from rsvib_torch.stacks.recorded_motion import compared_pairs
-from rsvib_torch.stacks.window_restoration import pair_verdict
-from rsvib_torch.stacks.windows import WindowRecord, record_fields
+from rsvib_torch.stacks.windows import WindowRecord
 from rsvib_torch.tracking.camera_path import WINDOW_FRAMES, CameraPath, camera_path, shake
 from rsvib_torch.tracking.window_fit import SIGNIFICANT, Tone, WindowPath
 from rsvib_torch.video import Margins
@@ -58,6 +55,8 @@ _COPY, _MEMORY, _MOST_IN_A_ROW = 0.15, 8, 3
 # Light that flickers more leaves many corners; those of unrelated frames that agree by chance are few
 _CUT, _THUMBNAIL, _FEW = 0.8, (16, 16), 64
 _MAX_COPIES = 0.05  # of the frames; with more, frames were taken at other times than stored: 143 Hz became 149 Hz
+# More shaking makes a part, or a video, worse: wrong settings make it 1.5 to 5 times as shaky. 0.1 px is not visible.
+_MORE_SHAKING, _VISIBLE_SHAKING = 1.1, 0.1  # -, px
 _SMALLEST = 0.02  # px at the corners; roll and zoom below are left out, because restoration is faster without
 
 
@@ -70,10 +69,6 @@ class VideoMotion:
     removed: Callable[[int], Vibration | FreeMotion]  # from a frame, the middle of which is the time origin
     faults: dict[int, str]  # number of each frame that could not be used, with the reason
     corners: dict[int, Corners]  # between the frame of this number and the next one, of the first ones of each part
-
-    def is_usable(self, index: int) -> bool:
-        """Whether a frame could be used, and is no copy."""
-        return index not in self.faults and (index == 0 or self.times[index] > self.times[index - 1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +164,10 @@ class VideoPasses:
         return not isinstance(path, CameraPath) or path.nearest(frames[len(frames) // 2]).residual < path.allowed
 
     def margins(self, motion: VideoMotion) -> Margins:
-        """The widest margins of all frames: how far outside of the frame the content of its border was recorded."""
+        """The widest margins of all frames: how far outside of the frame the content of its border was recorded.
+
+        They are even, i.e. whole pixels of chroma.
+        """
         widest = np.zeros(4)
         for index in range(len(self.starts)):
             if index not in motion.faults:
@@ -178,9 +176,9 @@ class VideoPasses:
                 x, y = (x, y) if timing.scan_axis == -2 else (x.T, y.T)
                 sides = [-y[0].min(), y[-1].max(), -x[:, 0].min(), x[:, -1].max()]
                 widest = np.maximum(widest, sides)
-        return self.frames.margins(Margins(*(math.ceil(side + 0.5) if side > 0.01 else 0 for side in widest)))
+        return Margins(*(2 * math.ceil(0.5 * (side + 0.5)) if side > 0.01 else 0 for side in widest))
 
-    # Verdict and record of a part
+    # Whether restoration helps, and the record of a part
 
     def shaking(self, motion: VideoMotion, tracks: list[FrameTrack]) -> dict[str, tuple[float, ...]] | None:
         """``WindowRecord.shaking`` from frames that follow each other; None if it is unknown.
@@ -212,45 +210,27 @@ class VideoPasses:
             places.append(places_at_rest(track.motion, recorded, starts, exposure))
         return replace(corners, places=0.5 * (places[0] + places[1]), offsets=places[1] - places[0])
 
-    def shakes_more(self, motion: VideoMotion, tracks: list[FrameTrack]) -> bool:
-        """Whether frames that follow each other shake more when they are restored, or it is unknown."""
-        measured = self.shaking(motion, tracks)
-        return measured is None or any(after > before for before, after in measured.values())
+    def is_worse(self, motion: VideoMotion, part: int, tracks: list[FrameTrack]) -> bool:
+        """Whether restoration makes a part shake more, by its first frames.
 
-    def verdict(self, motion: VideoMotion, frames: list[tuple[FrameTrack, Frame | str]]) -> RestorationVerdict | None:
-        """Whether restoration helps, from two neighbouring frames before they are steadied; None if unknown."""
-        usable = (pair for pair in pairwise(frames) if all(motion.is_usable(track.index) for track, _ in pair))
-        pair = next(usable, None)
-        if pair is None:
-            return None
-        (first, one), (second, other) = pair
-        undone, later, path = first.motion, second.motion, motion.path
-        if isinstance(one, str) or isinstance(other, str) or not isinstance(path, CameraPath):
-            return None
-        if not (isinstance(undone, Vibration) and isinstance(later, Vibration)):
-            return None
-        pixels = np.stack([self.frames.luma(one), self.frames.luma(other)])
-        images = counts_to_frames(pixels, self.frames.full_scale, "the video").to(self.frames.job.options.device)
-        # The path in both frames and between them: extrapolated from the first frame, a hand was wrong by 0.9 px.
-        axes = min(undone.num_axes, later.num_axes)
-        undone = undone if axes == undone.num_axes else undone.translation()
-        interval = second.time - first.time
-        step = np.diff(path.places(motion.times[[first.index, second.index]]), axis=0)[0, :axes]
-        change = later.image_motion[:axes] - undone.image_motion
-        mean = tensor(step / interval) * (undone.image_motion != 0)  # axes without vibration stay as taken
-        both = replace(
-            undone, image_motion=mean - 0.5 * change, image_acceleration=change / interval, image_shift=0.0 * mean
-        )
-        return pair_verdict(images, self.frames.job.timing, both, interval, self.frames.job.chosen)
+        If it is unknown, whether path and tones do not explain the corners of the part.
+        """
+        if not isinstance(motion.path, CameraPath):
+            return False
+        measured = self.shaking(motion, tracks)
+        if measured is None:
+            return not self.is_explained(motion, part)
+        return any(shakes_more(*both) for both in measured.values())
 
     def record(
         self,
         part: int,
         tracks: list[FrameTrack],
         motion: VideoMotion,
-        verdict: RestorationVerdict | None,
+        *,
+        is_worse: bool,
     ) -> WindowRecord:
-        """The record of a part of the video."""
+        """The record of a part of the video, which was left alone if restoration makes it worse."""
         path = motion.path
         detection = self._detection(path, motion, tracks) if isinstance(path, CameraPath) else None
         left = []
@@ -262,18 +242,22 @@ class VideoPasses:
                 )
                 if not sizes.any()
             ]
-        faults = {track.index: track.fault for track in tracks if track.fault is not None}
         moved = any(bool(track.motion.moving_axes().any()) for track in tracks if track.fault is None)
+        shaking = self.shaking(motion, tracks)
+        helps = shaking is not None and any(after < before for before, after in shaking.values())
+        outcome = "worse" if is_worse else "helps" if helps else None
         return WindowRecord(
-            **record_fields(verdict, faults, detection, restored=moved),
             window=part,
             first=tracks[0].index,
             last=tracks[-1].index,
             start_time=tracks[0].time,
             written=len(tracks),
+            frames="restored" if moved else "as taken",
+            detection=detection,
+            outcome=outcome,
+            bad_frames={str(track.index): track.fault for track in tracks if track.fault is not None},
             left_alone=tuple(left),  # tones are removed as they were measured, whatever explains them
-            error=None,
-            shaking=self.shaking(motion, tracks),
+            shaking=shaking,
         )
 
     def _detection(self, path: CameraPath, motion: VideoMotion, tracks: list[FrameTrack]) -> DetectedVibration:
@@ -453,6 +437,11 @@ class _FirstPass:
             both = np.broadcast_to(self.taken[[before[0], index]], corners.times.shape)
             corners = replace(corners, times=both)
         return (corners,)
+
+
+def shakes_more(before: float, after: float) -> bool:
+    """Whether frames shake visibly more, by rms motions in px, than before."""
+    return after > _MORE_SHAKING * before + _VISIBLE_SHAKING
 
 
 def tone_tables(tones: list[Tone], axes: int) -> Array:

@@ -83,7 +83,6 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     path = torch.stack([0.5 * torch.sin(800 * times), 0.3 * torch.cos(700 * times)], -1)
     recorded = rsv.FreeMotion.through(times, path)
     stripes = torch.stack([0.5 + 0.3 * torch.sin(rows[:, :1] * 0.5 + phase).expand(-1, 32) for phase in (0.0, 1.0)])
-    counts = (frames * 4095).round().clamp(0, 4095).numpy().astype(np.uint16)
     stack, motion_file = folder / "frames.npy", folder / "motion.csv"
     rsv.write_stack(stack, frames, dtype="float32")
     video = folder / "frames.mkv"
@@ -139,7 +138,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     pool |= {"count": 2, "shape": (3, 96, 64), "dtype": "float32", "frame": frames[0].numpy(), "x": scene}
     pool |= {"y": frames[0], "scene_shape": (160, 128), "tones": None, "flicker_frequency": 1000.0}
     pool |= {"results": [detected.std] * 2, "images": frames}
-    pool |= {"visible": torch.ones(96, 64, dtype=torch.bool), "other": rsv.Margins(1, 2, 3, 4), "place": torch.zeros(2)}
+    pool |= {"place": torch.zeros(2)}
     pool |= {"stated": timing, "agreeing": timing, "row_time": 1e-4, "pixel_size": 5e-6}
     pool |= {"exposure_times": [1e-3, 2.5e-4], "frame_rate": 30.0, "detections": [detected], "source": stack}
 
@@ -172,7 +171,6 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
         "read_manifest": {"path": folder / "out.npy.manifest.json"},
         "read_motion": {"path": motion_file, "unit": "rad", "focal_length": 100.0},
         "read_vibration": {"path": folder / "vibration.json"},
-        "restore_block": {"frames": counts, **options, "full_scale": 4095.0},
         "row_psf": {"starts": timing.row_starts(1, 96)[0], "num_nodes": 4},
         "save_figure": {"path": new["figure.png"], "dpi": 20},
         "simulate_frames": {"frame_size": (64, 48), "num_frames": 2, "generator": generator},
@@ -208,21 +206,17 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
         "Vibration": call(rsv.Vibration, amplitude=[1.2, 0.8], frequency=[130.0, 170.0], image_motion=(5.0, 3.0)),
         "VibrationDetector": call(rsv.VibrationDetector, **fast),
         "VibrationRestorer": call(rsv.VibrationRestorer, joint=False),
-        "VideoBorder": call(rsv.VideoBorder),
         "VibrationTracker": call(rsv.VibrationTracker, timing=rsv.SensorTiming(1e-4, 6, 104)),
-        "VibrationCorrector": call(rsv.VibrationCorrector, detection=fast, restoration={"method": "dewarp"}),
     }
     result |= constructed
     modules = {"VibrationDetector": detector, "VibrationRestorer": restorer, "RollingShutterVibration": augmentation}
     for name, module in modules.items():
         result[f"{name}.forward"] = call(module.forward)
-    corrector = rsv.VibrationCorrector(timing, detection=fast, restoration={"method": "dewarp"})
-    result["VibrationCorrector.forward"] = Call(corrector.forward, {"frames": frames[None, :, None]})
     result["FixedDewarp.forward"] = Call(rsv.FixedDewarp(timing, vibration, (96, 64), 3).forward, {"frames": frames})
     result["RollingShutterVibration.drawn_vibration"] = call(augmentation.drawn_vibration)
     report = rsv.process_stack(stack, folder / "again.npy", timing, **windows)
     described = (detected.std, curve, optics, sensor_noise, info, report, verdict, calibration, camera)
-    described += (tracked, rsv.Margins(1, 2, 3, 4), rsv.restoration_mtf(frames, timing, vibration))
+    described += (tracked, rsv.restoration_mtf(frames, timing, vibration))
     described += (detected.spectrum(), rsv.CameraMode("A", "B", "", 1920, 1080, 30.0, 0.01, 1e-4, 3, "forward", 1080))
     of_frame = {one.name: getattr(detected, one.name) for one in fields(rsv.FollowedVibration) if one.name != "times"}
     described += (rsv.FollowedVibration(**of_frame, times=times[0]),)

@@ -41,7 +41,6 @@ CONFIG = (
     + """
 [stack]
 window = 4
-bad_frames = "skip"
 """
 )
 _TOKENS = (*b'-1 0 99999999999999999999 1e999 nan null [] {} "" true \xff'.split(), b"[" * 60)

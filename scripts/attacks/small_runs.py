@@ -31,7 +31,6 @@ FORMATS: dict[str, tuple[str, dict[str, Any]]] = {
     "TIFF": ("out.tif", {}),
     "TIFF, zlib": ("packed.tif", {"compression": "zlib"}),
     "npy": ("out.npy", {}),
-    "npy, frames skipped": ("skipped.npy", {"bad_frames": "skip"}),
     "HDF5": ("out.h5", {}),
     "Zarr": ("out.zarr", {}),
     "PNG folder": ("frames", {}),

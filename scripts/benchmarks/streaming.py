@@ -1,7 +1,7 @@
-"""Long stacks: time and memory over the number of frames, memory limits of all methods, and workers of Dask.
+"""Long stacks: time and memory over the number of frames, and memory limits of all methods.
 
 A few simulated frames are repeated to form long stacks. Every run is a separate process, in which peak memory is
-measured. Workers of Dask are processes with one thread each; they start, import and warm up before anything is timed.
+measured.
 """
 
 import argparse
@@ -10,13 +10,10 @@ import subprocess
 import sys
 import tempfile
 import time
-from contextlib import ExitStack
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 import torch
 from harness import Rows, plain_environment, table
 
@@ -30,13 +27,12 @@ OPTIONS = {
     "frame_size": (1024, "streaming: rows and columns of the long stacks"),
     "memory": ("2GB", "streaming: memory of the process for the long stacks"),
     "smaller_size": (512, "streaming: rows and columns of other stacks"),
-    "smaller_frames": (57, "streaming: length of the stack for Dask; half of it for limits of the memory"),
+    "smaller_frames": (29, "streaming: length of the stack for limits of the memory"),
     "windows": ((1, 2), "streaming: windows at once"),
     "methods": (8, "streaming: at most so many options of restoration"),
-    "dask_workers": ((1, 2), "streaming: workers of Dask"),
 }
-QUICK = {"frames": (22,), "frame_size": 128, "smaller_size": 96, "smaller_frames": 44}
-QUICK |= {"windows": (1,), "methods": 1, "dask_workers": (1,)}
+QUICK = {"frames": (22,), "frame_size": 128, "smaller_size": 96, "smaller_frames": 22}
+QUICK |= {"windows": (1,), "methods": 1}
 _DRAWN, WINDOW = 14, 8  # frames; period of the vibration, and of the stack
 DETECTION = {"method": "bands", "tones": 1, "band_step": 32, "search": 8}
 RESTORATIONS: list[dict[str, Any]] = [
@@ -79,30 +75,13 @@ def peak_memory() -> float:
     raise OSError("the kernel does not report peak memory")
 
 
-def one_run(source: str, sink: str, size: int, dask_workers: int = 0, **options: Any) -> dict[str, Any]:
-    """Process a stack in this process, or by workers of Dask."""
+def one_run(source: str, sink: str, size: int, **options: Any) -> dict[str, Any]:
+    """Process a stack in this process."""
     common = {"window": WINDOW, "detection": DETECTION, "restoration": RESTORATIONS[0], "full_scale": 4095} | options
-    with ExitStack() as opened:
-        client: Any = None
-        if dask_workers:
-            import distributed  # noqa: PLC0415 - an extra
-
-            cluster = opened.enter_context(
-                distributed.LocalCluster(dask_workers, threads_per_worker=1, dashboard_address=None, memory_limit=0)
-            )
-            client = opened.enter_context(distributed.Client(cluster, set_as_default=False))
-            common["scheduler"] = cluster.scheduler_address
-            process_stack(source, sink, timing_of(size), **common)  # imports and warm-up of every worker
-
-        def counted() -> tuple[float, float, float, int]:
-            of_workers = sum(client.run(time.process_time).values()) if client else 0.0
-            sent = psutil.net_io_counters(pernic=True)["lo"].bytes_sent
-            return time.perf_counter(), time.process_time(), of_workers, sent
-
-        before = counted()
-        report = process_stack(source, sink, timing_of(size), **common)
-        seconds, cpu, of_workers, moved = (b - a for a, b in zip(before, counted(), strict=True))
-    figures = {
+    before = time.perf_counter(), time.process_time()
+    report = process_stack(source, sink, timing_of(size), **common)
+    seconds, cpu = time.perf_counter() - before[0], time.process_time() - before[1]
+    return {
         "frames": report.frames,
         "restored_windows": report.restored,
         "windows": report.windows,
@@ -110,9 +89,6 @@ def one_run(source: str, sink: str, size: int, dask_workers: int = 0, **options:
         "cpu_seconds_a_frame": cpu / report.frames,
         "peak_memory_gb": peak_memory() / 1e9,
     }
-    if dask_workers:
-        figures |= {"worker_seconds_a_frame": of_workers / report.frames, "moved_mb": moved / 1e6 / report.frames}
-    return figures
 
 
 def run_apart(**arguments: Any) -> dict[str, Any]:
@@ -124,7 +100,7 @@ def run_apart(**arguments: Any) -> dict[str, Any]:
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    """Runs of each length; runs whose limit is the estimated memory of some windows; a local run, and Dask."""
+    """Runs of each length; runs whose limit is the estimated memory of some windows."""
     results: Rows = []
     with tempfile.TemporaryDirectory() as folder:
         source, sink = Path(folder) / "frames.npy", Path(folder) / "out.tif"
@@ -134,7 +110,7 @@ def rows(options: argparse.Namespace) -> Rows:
             run = run_apart(source=str(source), sink=str(sink), size=size, memory=options.memory)
             results.append({"name": f"{count} frames of {size} px, memory {options.memory}", **run})
         size, paths = options.smaller_size, {"source": str(source), "sink": str(sink)}
-        write_long(source, options.smaller_frames // 2, size)
+        write_long(source, options.smaller_frames, size)
         info = rsv.read_stack_info(source)
         for restoration in RESTORATIONS[: options.methods]:
             for count in options.windows:
@@ -142,12 +118,6 @@ def rows(options: argparse.Namespace) -> Rows:
                 run = run_apart(**paths, size=size, memory=asked, workers=count, restoration=restoration)
                 text = ", ".join(f"{key}={value!r}" for key, value in restoration.items())
                 results.append({"name": f"{text}; {count} windows at once", "asked_gb": asked / 1e9, **run})
-        write_long(source, options.smaller_frames, size)
-        results.append({"name": "one worker, without Dask", **run_apart(**paths, size=size, workers=1)})
-        expected = sink.read_bytes()
-        for workers in options.dask_workers if find_spec("distributed") else ():
-            run = run_apart(**paths, size=size, dask_workers=workers)
-            results.append({"name": f"{workers} workers of Dask", "same": sink.read_bytes() == expected, **run})
     return results
 
 
@@ -155,20 +125,15 @@ def lines(results: Rows, options: argparse.Namespace) -> list[str]:
     columns = {
         "s per frame": "seconds_a_frame",
         "CPU s per frame of this process": "cpu_seconds_a_frame",
-        "of workers": "worker_seconds_a_frame",
-        "MB over the local network": "moved_mb",
         "limit (GB)": "asked_gb",
         "peak (GB)": "peak_memory_gb",
     }
-    cells = [
-        (row["name"], *(f"{row[key]:.3f}" if key in row else "" for key in columns.values()), row.get("same", ""))
-        for row in results
-    ]
+    cells = [(row["name"], *(f"{row[key]:.3f}" if key in row else "" for key in columns.values())) for row in results]
     return [
         f"Frames of 16 bits, windows of {WINDOW}, detection by bands, restoration by dewarp if not stated; frames of "
         f"later runs have {options.smaller_size} x {options.smaller_size} px.",
         "",
-        *table(("run", *columns, "same bytes as without Dask"), cells),
+        *table(("run", *columns), cells),
     ]
 
 

@@ -15,6 +15,7 @@ import rsvib_torch as rsv
 from rsvib_torch.checks.values import members_of
 from rsvib_torch.datasets import city_and_fields
 from rsvib_torch.results.reason import Reason
+from rsvib_torch.video import Margins
 
 TIMING = rsv.SensorTiming(1e-4, 6, 104)
 LONG = rsv.SensorTiming(1e-4, 6, 104, frame_start_times=[0.0, 2.0])
@@ -170,7 +171,6 @@ def test_pixels_beyond_all_scales(value):
         (lambda: rsv.row_psf(VIBRATION, STARTS, TIMING, quadrature="simpson"), "quadrature must be 'midpoint'"),
         (lambda: rsv.row_psf(ROLL, TIMING.row_starts(1, 8), TIMING), "not defined with roll, zoom or a camera"),
         (lambda: rsv.MotionCheck(torch.zeros(3), torch.zeros(2), True, (), *CURVES), r"before must have shape \(2,\)"),
-        (lambda: rsv.restore_block(nested(), TIMING), "frames must be an instance of ndarray, got a nested tensor"),
         (lambda: rsv.detect_motion(FRAMES, TIMING, knot_rows=10**9, **BANDS), "knot_rows must be at most"),
         (
             lambda: rsv.FreeMotion.from_samples(torch.arange(11.0), torch.zeros(11, 2, requires_grad=True)),
@@ -283,9 +283,7 @@ def test_pixels_beyond_all_scales(value):
         (lambda: flicker(FRAMES[:1], on_fraction=0.5, light_contrast=0.5), "not both"),
         (lambda: flicker(FRAMES[:1], 30.0, frame_rate=29.97), "slower than a frame"),
         (lambda: flicker(torch.full((1, 64, 64), 900, dtype=torch.int16)), "full_scale"),
-        (lambda: rsv.VideoBorder("zoom"), "border must be 'mirror'"),
-        (lambda: rsv.VideoBorder("crop"), "margins go with border='crop' and only with it"),
-        (lambda: rsv.Margins(4, 4, 0, 0).cut(torch.zeros(8, 8)), "leave nothing of frames of 8 x 8 px"),
+        (lambda: Margins(4, 4, 0, 0).cut(torch.zeros(8, 8)), "leave nothing of frames of 8 x 8 px"),
         (lambda: Reason("unknown"), "code must be one of"),
         (lambda: Reason("tone_blind", value=0.05, limit=0.1), "do not fit its text"),
         (lambda: Reason("tone_averaged_out", value="much", limit=0.1), "do not fit its text"),

@@ -56,13 +56,6 @@ def test_from_pipe_to_pipe(clip, monkeypatch, capfdbinary):
     assert f"{COUNT} frames in".encode() in shown.err
 
 
-def test_a_steady_image_on_the_page(clip, capsys):
-    assert rsvib("live", clip, *CAMERA[:4], "--page", 0, "--border", "hold", "--steady", 0.2) == 0
-    shown = capsys.readouterr()
-    assert "per second, from the times in" in shown.out  # the frame rate of the file
-    assert "rsvib: note: the page is http://127.0.0.1:" in shown.err
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -72,7 +65,6 @@ def test_a_steady_image_on_the_page(clip, capsys):
         (("none.mp4",), "none.mp4: no such file; a camera is a number or a URL"),
         (("CLIP", "--out", "still.gif"), "a live video is written to .mp4, .mov, .m4v or .mkv"),
         (("CLIP", "--out", "CLIP", "--overwrite"), "it is the input"),
-        (("0", "--border", "crop"), "'crop' is not one of 'mirror', 'hold'"),
     ],
 )
 def test_wrong_options_are_refused_in_one_line(clip, arguments, message, capsys, tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""Free memory: the smallest of the machine, its control groups (versions 1 and 2, nested) and the address space."""
+"""Free memory: the smallest of the machine, its control groups (nested) and the address space."""
 
 import psutil
 import pytest
@@ -21,11 +21,9 @@ def write(root, files):
 
 
 def group(root, folder, limit, used, cached=0, high="max"):
-    """Files of a control group of version 2, or of version 1 below the folder ``memory``."""
+    """Files of a control group."""
     values = {"memory.max": limit, "memory.high": high, "memory.current": used}
-    if folder.startswith("memory"):
-        values = {"memory.limit_in_bytes": limit, "memory.usage_in_bytes": used}
-    values["memory.stat"] = f"anon 5\ninactive_file {cached}\ntotal_inactive_file {cached}"
+    values["memory.stat"] = f"anon 5\ninactive_file {cached}\nactive_file 7"
     write(root, {f"sys/fs/cgroup/{folder}/{name}": value for name, value in values.items()})
 
 
@@ -33,8 +31,7 @@ def group(root, folder, limit, used, cached=0, high="max"):
     ("own", "groups", "free"),
     [
         ("0::/", [], 100),
-        ("5:cpu:/job\n4:memory:/job\n0::/", [("memory/job", 8 * GB, 5 * GB, 1 * GB)], 4),
-        ("4:memory:/user/job", [("memory/user/job", 8 * GB, GB), ("memory/user", 6 * GB, 4 * GB)], 2),  # group above
+        ("0::/user/job", [("user/job", 8 * GB, GB), ("user", 6 * GB, 4 * GB)], 2),  # group above
         ("0::/a/b/c", [("a/b/c", "max", GB), ("a", 5 * GB, 2 * GB, GB)], 4),
         ("0::/job", [("job", 8 * GB, GB, 0, 3 * GB)], 2),  # slowed down from memory.high on
         ("0::/job", [("job", GB, 2 * GB)], 0),  # already exceeded

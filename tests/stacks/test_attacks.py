@@ -1,7 +1,7 @@
 """Attacks on runs (scripts/attacks): the result is right, or a one-line error changes nothing.
 
 Runs are killed at any call, lose what was not synchronised, are resumed with damaged and edited files, on full disks,
-with links in their place, beside others, with workers that die, and with outputs that are their inputs.
+with links in their place, beside others, and with outputs that are their inputs.
 Recordings of a camera end by signals, on full disks, and without a reader.
 docs/reliability.md has the numbers of many more trials.
 """
@@ -38,6 +38,5 @@ def test_no_attack_loses_or_falsifies_a_result(tmp_path, name, factor):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "count", "least"), [("disks", 60, 0.0), ("workers", 4, 0.25)])
-def test_full_disks_and_dying_workers(tmp_path, name, count, least):
-    check(name, tmp_path, count, 0, least)
+def test_full_disks(tmp_path):
+    check("disks", tmp_path, 60, 0, 0.0)

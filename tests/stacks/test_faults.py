@@ -92,10 +92,10 @@ def test_full_disk_is_an_error_before_the_computation(whole, tmp_path, monkeypat
 
 def test_disk_that_fills_up_keeps_complete_windows(whole, tmp_path):
     # the files of single windows fit, the stack does not
-    _, message = fork(process_with_limit, whole / "frames.tif", tmp_path / "out.npy", 100_000, bad_frames="skip")
+    _, message = fork(process_with_limit, whole / "frames.tif", tmp_path / "out.npy", 100_000)
     assert f"File too large; {WINDOWS} windows are complete, resume the run to continue" in message
     assert not (tmp_path / "out.npy").exists()
-    report = process_small(whole / "frames.tif", tmp_path / "out.npy", bad_frames="skip", resume=True)
+    report = process_small(whole / "frames.tif", tmp_path / "out.npy", resume=True)
     assert report.resumed == WINDOWS
     assert (tmp_path / "out.npy").read_bytes() == (whole / "out.npy").read_bytes()
 

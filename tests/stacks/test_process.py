@@ -56,7 +56,7 @@ def test_window_equals_detection_and_restoration_of_its_frames(whole):
     torch.testing.assert_close(restored[8:10], expected.clamp(0, 1), atol=0.6 / 4095, rtol=0)
 
 
-@pytest.mark.parametrize("options", [{"workers": 3}, {"memory": "900MB", "workers": 8}, {"bad_frames": "skip"}])
+@pytest.mark.parametrize("options", [{"workers": 3}, {"memory": "900MB", "workers": 8}])
 def test_result_does_not_depend_on_workers_memory_or_staging(whole, tmp_path, options):
     threads = torch.get_num_threads()
     process_small(whole / "frames.tif", tmp_path / "out.tif", **options)
@@ -109,8 +109,7 @@ def test_stack_is_restored_with_detections_of_an_earlier_run(whole, tmp_path):
         process_small(whole / "frames.tif", tmp_path / "other.tif", given=manifest.detections(), window=4)
 
 
-@pytest.mark.parametrize("choice", ["pass", "skip"])
-def test_bad_frames_are_listed_and_the_others_restored(whole, tmp_path, choice):
+def test_bad_frames_are_listed_and_the_others_restored(whole, tmp_path):
     counts = tifffile.imread(whole / "frames.tif").astype(np.float32) / 4095
     counts[5] = 0.5  # constant
     counts[9, 4, 5] = 3e38
@@ -119,7 +118,7 @@ def test_bad_frames_are_listed_and_the_others_restored(whole, tmp_path, choice):
     np.save(tmp_path / "frames.npy", counts)
     with (tmp_path / "frames.npy").open("r+b") as file:
         file.truncate((tmp_path / "frames.npy").stat().st_size - 100)  # the last frame
-    report = process_small(tmp_path / "frames.npy", tmp_path / "out.npy", bad_frames=choice, window=9)
+    report = process_small(tmp_path / "frames.npy", tmp_path / "out.npy", window=9)
     manifest = read_manifest(report.manifest)
     assert list(manifest.bad_frames) == ["5", "9", "12", "14", "16"]
     assert "constant" in manifest.bad_frames["5"]
@@ -129,16 +128,11 @@ def test_bad_frames_are_listed_and_the_others_restored(whole, tmp_path, choice):
     assert "frame 16 lies beyond the end of the file" in manifest.bad_frames["16"]
     out = np.load(tmp_path / "out.npy")
     good = [index for index in range(FRAMES) if str(index) not in manifest.bad_frames]
-    if choice == "skip":
-        assert len(out) == report.frames == FRAMES - 5
-        restored = out
-    else:
-        np.testing.assert_array_equal(out[[5, 9, 12, 14]], counts[[5, 9, 12, 14]])
-        assert np.isnan(out[16]).all()
-        restored = out[good]
+    np.testing.assert_array_equal(out[[5, 9, 12, 14]], counts[[5, 9, 12, 14]])
+    assert np.isnan(out[16]).all()
     assert report.bad_frames == 5
     assert report.failed == 0
-    assert min(decibel(frame, STILL, 12) for frame in restored) > 28
+    assert min(decibel(frame, STILL, 12) for frame in out[good]) > 28
 
 
 def test_window_without_two_usable_frames_is_written_unchanged(whole, tmp_path):
