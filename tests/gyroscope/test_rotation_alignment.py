@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -136,22 +137,32 @@ def test_dashboard_is_excluded():
     assert float((found.bias - torch.tensor(BIAS, dtype=torch.float64)).abs().max()) < 0.02
 
 
-def test_command_estimates_the_clock(frames, tmp_path, capsys):
-    (tmp_path / "camera.toml").write_text("[sensor]\nrow_time = 8e-5\nexposure_rows = 10\nframe_rows = 420\n")
+def test_command_estimates_clock_and_row_time(frames, tmp_path, capsys):
+    (tmp_path / "camera.toml").write_text("[sensor]\nrow_time = 7e-5\nexposure_rows = 11.4\nframe_rows = 480\n")
     rsv.write_stack(tmp_path / "frames.tif", frames)
     rates = recorded("ZXY")
+    write_rates(tmp_path / "rates.csv", rates)
+    known = ("restore", tmp_path / "frames.tif", tmp_path / "out.tif", "--config", tmp_path / "camera.toml")
+    arguments = (*known, "--motion", tmp_path / "rates.csv", "--focal-length", 380, "--device", "cpu")
     log = "GYROFLOW IMU LOG\nversion,1.3\nid,test\norientation,XYZ\ntscale,1e-6\ngscale,1e-6\nt,gx,gy,gz\n"
     scaled = 1e6 * torch.cat([rates.times[:, None], rates.rates], 1)
     (tmp_path / "clip.gcsv").write_text(log + "\n".join(",".join(f"{v:.0f}" for v in row) for row in scaled.tolist()))
-    known = ("restore", tmp_path / "frames.tif", tmp_path / "out.tif", "--config", tmp_path / "camera.toml")
-    arguments = (*known, "--motion", tmp_path / "clip.gcsv", "--device", "cpu", "--json")
-    assert rsvib(*arguments) == 0
+    (tmp_path / "right.toml").write_text("[sensor]\nrow_time = 8e-5\nexposure_rows = 10\nframe_rows = 420\n")
+    of_log = (*known[:3], "--config", tmp_path / "right.toml", "--motion", tmp_path / "clip.gcsv", "--json")
+    assert rsvib(*of_log) == 0
     found = json.loads(capsys.readouterr().out)["alignment"]
     assert (found["orientation"], found["offset"]) == ("ZXY", pytest.approx(0.35, abs=1e-3))
     assert found["focal_length"] == pytest.approx(FOCAL_LENGTH, rel=0.02)
+    assert rsvib(*arguments, "--fit-row-time", "--offsets", 0.3, 0.4, "--overwrite") == 0
+    printed = capsys.readouterr().out
+    assert float(re.search(r"time 0 of the frames is ([\d.]+)", printed).group(1)) == pytest.approx(0.35, abs=3e-4)
+    assert 78 < float(re.search(r"row time ([\d.]+)", printed).group(1)) < 82
     restored = rsv.read_stack(tmp_path / "out.tif")
     before, after = (float((one[1:] - one[:-1])[..., 20:-20, 20:-20].square().mean()) for one in (frames, restored))
     assert after < 0.1 * before
+    assert rsvib(*arguments, "--offsets", 0.36, 0.4, "--overwrite") == 2
+    both = ("--offsets", 0.3, 0.4, "--offset", 0.35, "--overwrite")
+    assert "give one of them" in refused(capsys, *arguments, *both)
     alone = ("--offset", 0.35, "--overwrite")
     assert "axes and clock of a gyroscope are estimated from the frames" in refused(capsys, *arguments, *alone)
 

@@ -22,9 +22,7 @@ def window(number, vibration, **options):
     """Window of frames 4 n ... 4 n + 4; None as the vibration for a failed one."""
     detection = None if vibration is None else detection_of(vibration, **options)
     start, error = 4 * number * TIMING.frame_period, "the frames have no contrast" if detection is None else None
-    return WindowRecord(
-        number, 4 * number, 4 * number + 4, start, 4, "as taken", detection, (), None, None, None, error, {}
-    )
+    return WindowRecord(number, 4 * number, 4 * number + 4, start, 4, "as taken", detection, error=error)
 
 
 def manifest_of(*windows):
