@@ -16,7 +16,7 @@ from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
 from rsvib_torch.detection.sensitivity import assumptions, timing_sensitivity, with_row_time_std
 from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.detection.tones.fit import ToneFit, model_displacements, motion_of_fit
-from rsvib_torch.detection.verdict import Findings
+from rsvib_torch.detection.verdict import Findings, contradicted_axes
 from rsvib_torch.frames.orientation import (
     findings_from_row_order,
     magnitudes_from_row_order,
@@ -57,6 +57,8 @@ def assembled(
     heights = sequence_from_row_order(curve.heights, timing)
     residual = (curve.offsets - predicted).abs().nanmean(dim=(1, 2))
     reliable = [[not of_axis for of_axis in of_stack] for of_stack in findings]
+    # The axes of a stack have one timing, which the rows of one of them may contradict.
+    uncertain = [any(contradicted_axes(of_stack)) and not all(of_stack) for of_stack in findings]
     stds = [
         of and with_row_time_std(scale.std(of).from_row_order(timing), vibration, sensitivity, timing)
         for of in (std, std_if_hidden_tone)
@@ -78,7 +80,7 @@ def assembled(
         reliable=magnitudes_from_row_order(torch.tensor(reliable, device="cpu"), timing),
         findings=tuple(findings_from_row_order(of_stack, timing) for of_stack in findings),
         sensitivity=sensitivity,
-        assumptions=assumptions(vibration, sensitivity, row_timing, num_frames, scale.height, blur),
+        assumptions=assumptions(vibration, sensitivity, row_timing, num_frames, scale.height, blur, uncertain),
         timing=timing,
     ).to(curve.offsets.device)
 

@@ -4,6 +4,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -106,8 +107,13 @@ def assumptions(
     num_frames: int,
     num_rows: int,
     blur: Array | None = None,
+    contradicted: Sequence[bool] = (),
 ) -> tuple[tuple[str, ...], ...]:
-    """What frames cannot contradict, with its effect on vibrations (B) in image axes; ``blur`` of ``OtherMotion``."""
+    """What frames cannot contradict, with its effect on vibrations (B) in image axes; ``blur`` of ``OtherMotion``.
+
+    ``contradicted``: whether the rows contradict one axis of a stack, which a wrong timing of all of them may cause. With
+    the readout in the wrong direction, two axes of 28 were reliable beside such an axis, and wrong.
+    """
     # 1. Sentences about all stacks.
     sentences, times = [], ["exposure_rows"]
     if timing.frame_start_times is None:
@@ -148,6 +154,11 @@ def assumptions(
         effects = [text for name, change in of_stack for text in _effects(name, tones, change, timing)]
         if blur is not None:
             effects += _exposure_range(tones, timing, *blur[stack, :2].tolist())
+        if any(contradicted[stack : stack + 1]):
+            effects.append(
+                "readout direction, frame_rows and row_time: tones do not explain the other axis, as with a wrong "
+                "timing; the motion along it may also be none of tones"
+            )
         of_stacks.append((*sentences, *effects) if tones else ())
     return tuple(of_stacks)
 

@@ -261,6 +261,9 @@ def halves_move_apart(other: OtherMotion) -> Array:
 # linear in the column, and the rows moved by 4 times the difference of their halves; clouds, parallax and objects had
 # 0.12 px and more, motions that are no sums of tones 10 times and more.
 _MAX_UNEVEN, _MAX_MOVED = 3.0, 8.0  # of the permitted difference of the halves, of the difference of the halves
+# Of the permitted difference of the halves, difference along the axis itself: 13 of a subject on half of the frame,
+# whose motion was reliable as that of the camera; none of 200 other axes is refused for it
+_MAX_TWO_MOTIONS = 4.0
 # of the difference of the halves: roll of 4 to 20 mrad in 300 columns has 0.14 to 0.17, because differences of a pixel
 # are not linear in the gradients; halves at two distances have 0.9
 _MAX_UNEVEN_PART = 0.25
@@ -280,15 +283,22 @@ def rotation_possible(other: OtherMotion, uneven: Array, aspect: float) -> Array
 
 
 def rotation_reasons(axis: int, axes: int, differential: Sequence[float], size: float) -> list[Reason]:
-    """Reasons against an axis from rotation and zoom, which move the halves of a row apart along the other axis.
+    """Reasons against an axis from rotation, zoom and objects, which move the halves of a row apart.
 
     A roll by theta moves the halves of a row by ``theta W / 4`` along y in opposite directions, and rows by up to
-    ``theta H / 2`` along x. A zoom does the same with the axes exchanged. Rows of both axes are concerned by parallax.
+    ``theta H / 2`` along x. A zoom does the same with the axes exchanged. Halves that move apart along the axis itself
+    by more show two motions, so that their mean is that of neither.
 
     ``differential`` (2,) px is the rms difference of the displacements along a row that the motion does not explain,
     and ``size`` px the rms offset along the axis.
     """
-    apart, allowed = max(differential) if axes > 2 else differential[1 - axis], float(_max_apart(size))
+    allowed = float(_max_apart(size))
+    if axes > 2:
+        apart = max(differential)
+    elif differential[axis] > _MAX_TWO_MOTIONS * allowed:
+        apart = differential[axis]
+    else:
+        apart = differential[1 - axis]
     code = "strips_apart" if axes > 2 else "halves_apart"
     return [Reason(code, AXIS_NAMES[axis], apart, allowed)] if apart > allowed else []  # not if it is NaN
 

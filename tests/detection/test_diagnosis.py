@@ -112,6 +112,17 @@ def test_a_batch_names_the_cause_of_its_own_stack(frames):
     assert [cause.code for cause in causes(found[1])] == ["other_readout_direction"]
 
 
+def test_an_axis_beside_one_that_is_contradicted_has_an_assumption():
+    """With a wrong readout direction, two axes of 28 were reliable, and wrong, beside a contradicted one."""
+
+    def curve(times):
+        return np.where([True, False], MOTION.displacement(times), walk.displacement(times))
+
+    found = detect_vibration(recorded((HEIGHT, WIDTH), TIMING, Curve(curve), 4, 0.005, seed=8), TIMING)
+    assert found.reliable.tolist() == [True, False]
+    assert "tones do not explain the other axis" in found.assumptions[-1]
+
+
 BLURRED_SIZE = 192, 160
 BLURRED_TIMING = SensorTiming(row_time=1e-4, exposure_rows=30, frame_rows=300)
 LARGE_MOTION = Motion((4.0, 3.0), (47.0, 61.0), (0.4, 1.3))
@@ -160,6 +171,13 @@ def test_parallax_does_not_refuse_halves_that_vibrate_alike():
     assert (np.abs(error) < 4 * found.std.amplitude[:, 0].numpy()).all()
     # two frames cannot tell parallax from a uniform roll
     assert "halves_apart" in set.union(*codes(detect_vibration(beside([LARGE_MOTION, moving], 2), BLURRED_TIMING)))
+
+
+def test_a_subject_on_half_of_the_frame_is_not_the_camera():
+    """It moves along x by 1.7 px at 8.9 Hz, which was reliable as the vibration of the camera."""
+    subject = Motion((1.7, 0.0), (8.9, 0.0), (0.0, 0.0), (40.0, 10.0))
+    found = detect_vibration(beside([subject, LARGE_MOTION], 8), BLURRED_TIMING)
+    assert not found.reliable.any()
 
 
 @pytest.mark.parametrize("axis", [0, 1])

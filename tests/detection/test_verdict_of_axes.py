@@ -106,8 +106,9 @@ def rows_of(unexplained=0.0, correlated=0.0, differential=0.0, measured=1.0, blu
         ({"unexplained": 0.02, "correlated": 0.005, "differential": 0.02}, [[], []]),
         ({"unexplained": 0.3}, [["rows_unexplained"], []]),
         ({"correlated": 0.1}, [["neighbours_unexplained"], []]),
-        ({"differential": 0.3}, [[], ["halves_apart"]]),  # along x: a zoom, which displaces rows along y
-        ({"unexplained": 0.3, "differential": 0.3}, [["rows_unexplained"], ["halves_apart"]]),
+        ({"differential": 0.1}, [[], ["halves_apart"]]),  # along x: a zoom, which displaces rows along y
+        ({"differential": 0.3}, [["halves_apart"]] * 2),  # two motions along x
+        ({"unexplained": 0.3, "differential": 0.1}, [["rows_unexplained"], ["halves_apart"]]),
         ({"measured": 0.4}, [["rows_not_registered"]] * 2),
         ({"blur": (0.5, 0.1, 0.05)}, [["blur_contradicts_exposure"]] * 2),
         ({"blur": (0.5, 0.2, 0.05)}, [[], []]),
