@@ -111,8 +111,8 @@ def assumptions(
 ) -> tuple[tuple[str, ...], ...]:
     """What frames cannot contradict, with its effect on vibrations (B) in image axes; ``blur`` of ``OtherMotion``.
 
-    ``contradicted``: whether the rows contradict one axis of a stack, which a wrong timing of all of them may cause. With
-    the readout in the wrong direction, two axes of 28 were reliable beside such an axis, and wrong.
+    ``contradicted``: whether the rows contradict one axis of a stack, which a wrong timing of all of them may cause.
+    With the readout in the wrong direction, two axes of 28 were reliable beside such an axis, and wrong.
     """
     # 1. Sentences about all stacks.
     sentences, times = [], ["exposure_rows"]

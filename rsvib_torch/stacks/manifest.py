@@ -236,6 +236,8 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
                     number, why = next(iter(refused.items()))
                     text = f"{name} is restored as measured, but is not reliable in"
                     vibration.append(wrapped(f"{text} {number_of(len(refused), 'window')}; in window {number}: {why}"))
+            assumed = [str(one) for found in self.detections() if found is not None for one in found.assumptions]
+            vibration += [wrapped(f"assumed: {one}") for one in assumed[:1]]
         return vibration, restoration
 
     @property

@@ -22,6 +22,8 @@ _LEAST_PART, _MOST_PART = 0.4, 2.5  # of those that tones propose; row times are
 # a drone: at most 1.06 with the right row time, but for 1.20 and 1.33 where corners are few or not explained; 1.19 to 5
 # with 16 wrong ones, 0.5 to 2 times the right one, which tones then propose within 0.5 %
 _CONTRADICTED = 1.12
+# Of what the stated readout leaves, up to which another one explains the corners as well: without a hand, 1.00
+_AS_WELL = 1.02
 # Of the frame rate, by which the frequency within a frame is changed to find that of a wave
 _COARSE, _FINE = np.array([-0.375, -0.125, 0.125, 0.375]), np.arange(-4, 5) / 8
 _SAME_PART = 0.005  # between parts, which turns a tone of five periods within a frame by 5 degrees at its ends
@@ -112,6 +114,12 @@ def compared_readouts(fit: WindowFit, readout: float) -> WindowPath:
         other.solve(rounds)
         return other
 
+    def described(part: float) -> str:
+        if part <= 0.0:
+            return "all at once" if part == 0.0 else "in reverse"
+        tones = dict.fromkeys(f"{wave.alias(part, interval):.4g}" for wave in waves)
+        return f"in {part:.2f} times the time, with tones of {', '.join(tones)} Hz"
+
     # 1. The readouts with which each wave is one tone, without those at which all tones are as with the stated readout.
     proposed = sorted(part for wave in waves for part in wave.parts(interval)) if waves else _WITHOUT_TONES
     parts = [
@@ -123,16 +131,15 @@ def compared_readouts(fit: WindowFit, readout: float) -> WindowPath:
             or any(wave.alias(part, interval) != wave.alias(1.0, interval) for wave in waves)
         )
     ]
-    # 2. The best of them after one round, from the weights of the stated readout, must leave less in a robust fit.
+    # 2. The best of them after one round, from the weights of the stated readout, must leave less in a robust fit. It
+    # may do so by waves that have not been found as tones with the stated readout.
     left = {part: with_part(part, 1).unexplained for part in (-1.0, 0.0, *parts)}
     part = min(left, key=lambda one: left[one])
     other = with_part(part, ROUNDS)
-    if other.unexplained * _CONTRADICTED > fit.unexplained:
-        return fit.path()
-    # 3. It may do so by waves that have not been found as tones with the stated readout.
-    if other.unexplained * _CONTRADICTED > with_part(1.0, ROUNDS).unexplained:
-        return fit.path()
-    name = {-1.0: "in reverse", 0.0: "all at once"}.get(part, f"in {part:.2f} times the time")
-    found = name, math.sqrt(fit.unexplained), math.sqrt(other.unexplained)
+    allowed = other.unexplained * _CONTRADICTED
+    if allowed > fit.unexplained or allowed > with_part(1.0, ROUNDS).unexplained:
+        agreeing = [one for one in parts if left[one] < _AS_WELL * fit.unexplained and one > 0.0 and waves]
+        return fit.path(agreeing=tuple(map(described, sorted(agreeing, key=lambda one: abs(math.log(one))))))
+    found = described(part).partition(" with")[0], math.sqrt(fit.unexplained), math.sqrt(other.unexplained)
     # Rows that are read the other way, or all at once, are displaced along another path.
     return (other if part <= 0.0 else fit).path(found, is_of_other=part <= 0.0)

@@ -177,6 +177,7 @@ class WindowPath:
     # with the stated and with this readout
     other_readout: tuple[str, float, float] | None
     is_of_other: bool  # whether the path is that with this readout, because its rows are displaced along another path
+    agreeing: tuple[str, ...]  # other readouts that explain the corners as well, and the frequencies of their tones
 
     def path(self, times: Array, derivative: int = 0) -> Array:
         """(N, 4) components of the path, or their derivatives, at times (N,) in s."""
@@ -460,14 +461,20 @@ class WindowFit:
 
         self.tones = [tone for tone, wave in zip(self.tones, waves, strict=True) if is_kept(tone, wave)]
 
-    def path(self, other_readout: tuple[str, float, float] | None = None, *, is_of_other: bool = False) -> WindowPath:
+    def path(
+        self,
+        other_readout: tuple[str, float, float] | None = None,
+        *,
+        is_of_other: bool = False,
+        agreeing: tuple[str, ...] = (),
+    ) -> WindowPath:
         """The result of the fit; the arguments are those of ``WindowPath``."""
         knots = self.knots.T / np.array([1.0, 1.0, self.reach, self.reach])
         residual = residual_of_most = float(np.median(self.distance)) / _HALF
         if not self.layer.all():  # with a subject on 40 % of the frame, tones of 0.1 px were found that are none
             residual_of_most = float(np.quantile(self.distance, 0.8)) / _FOUR_FIFTHS
         of_window, of_fit = (self.origin, self.start, self.step, knots, tuple(self.tones)), (residual, residual_of_most)
-        return WindowPath(*of_window, *of_fit, other_readout, is_of_other)
+        return WindowPath(*of_window, *of_fit, other_readout, is_of_other, agreeing)
 
     def is_apart_from(self, frequency: float, others: Array) -> NDArray[np.bool_]:
         """Whether other frequencies are not those of a tone, nor of a change of its amplitude."""

@@ -32,6 +32,7 @@ from rsvib_torch.results.reason import Reason
 from rsvib_torch.stacks.job import stored_frame
 from rsvib_torch.stacks.recorded_motion import compared_pairs
 from rsvib_torch.stacks.windows import WindowRecord
+from rsvib_torch.text import number_of
 from rsvib_torch.tracking.camera_path import WINDOW_FRAMES, CameraPath, camera_path, shake
 from rsvib_torch.tracking.window_fit import SIGNIFICANT, Tone, WindowPath
 from rsvib_torch.video import Margins
@@ -313,8 +314,17 @@ class VideoPasses:
             residual=torch.full((2,), window.residual, dtype=torch.float64),
             reliable=torch.tensor([not reasons for reasons in findings]),
             findings=findings,
-            assumptions=(),
+            assumptions=self._assumptions(window),
         )
+
+    def _assumptions(self, window: WindowPath) -> tuple[str, ...]:
+        """What the corners of a window cannot contradict."""
+        if not window.agreeing:
+            return ()
+        first, more = " or ".join(window.agreeing[:2]), len(window.agreeing) - 2
+        others = f" (and {number_of(more, 'other readout')})" if more > 0 else ""
+        row_time = f"row_time={self.frames.job.timing.row_time:.4g} s"
+        return (f"{row_time}: the corners agree as well with rows that are read {first}{others}",)
 
     def _without_blur(self, amplitude: Array, frequency: Array) -> Array:
         """Amplitudes in px of tones in Hz without what the blur of the corners adds to them.

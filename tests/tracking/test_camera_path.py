@@ -34,7 +34,15 @@ def vibration(t, tones, decay, sweep):
 
 
 def recorded(
-    tones, subject=True, decay=np.inf, sweep=0.0, timing=TIMING, samples=SAMPLES, count=COUNT, zoom=(0.0, 0.0)
+    tones,
+    subject=True,
+    decay=np.inf,
+    sweep=0.0,
+    timing=TIMING,
+    samples=SAMPLES,
+    count=COUNT,
+    zoom=(0.0, 0.0),
+    of_hand=1.0,
 ):
     """(T, H, W) counts: a scene whose left part is nearer, with a subject that walks through, as a hand records it."""
     scene = spline_filter(draw_scene(HEIGHT + 160, WIDTH + 160, 3), order=3)
@@ -47,9 +55,9 @@ def recorded(
         total = np.zeros((HEIGHT, WIDTH))
         for sample in range(samples):
             t = number / RATE + y * timing.row_time + (sample + 0.5) / samples * timing.exposure_time
-            (dx, dy, roll, size), moved = hand(t), vibration(t, tones, decay, sweep)
+            (dx, dy, roll, size), moved = of_hand * hand(t), vibration(t, tones, decay, sweep)
             size = size + zoom[0] * np.sin(2 * np.pi * zoom[1] * t)
-            near = np.where(x < 0.3 * WIDTH, 3.0 * np.sin(2 * np.pi * 0.7 * t), 0.0)
+            near = np.where(x < 0.3 * WIDTH, 3.0 * of_hand * np.sin(2 * np.pi * 0.7 * t), 0.0)
             # content at p appears at p + D(p): to first order, as the displacement is defined
             at_x = from_x - (dx + moved[0] + near - roll * from_y + size * from_x)
             at_y = from_y - (dy + moved[1] + roll * from_x + size * from_y)
@@ -111,6 +119,13 @@ def test_tones_beside_a_hand_show_the_row_time(factor):
     stated = SensorTiming(row_time, TIMING.exposure_time / row_time, 1 / RATE / row_time)
     part, *_ = fitted(recorded(TONES, subject=False), stated)[1].windows[0].other_readout
     assert float(part.split()[1]) == pytest.approx(1 / factor, abs=0.015)
+
+
+def test_without_a_hand_other_row_times_agree_with_a_tone():
+    tones = {0: (1.2, 93.0, 0.3), 1: (0.9, 93.0, 1.0)}
+    agreeing = fitted(recorded(tones, subject=False, of_hand=0.02))[1].windows[0].agreeing
+    assert "in 0.76 times the time, with tones of 123 Hz" in agreeing
+    assert fitted(recorded(tones, subject=False))[1].windows[0].agreeing == ()
 
 
 def test_several_tones_of_an_axis_are_told_from_their_aliases():
