@@ -36,6 +36,7 @@ from rsvib_torch.detection.tones.selection import find_tones, robust_fit, too_sm
 from rsvib_torch.detection.tones.uncertainty import (
     with_further_tones,
     with_unknown_amplitudes,
+    with_unknown_image_motion,
     with_weak_aliasing,
     without_aliasing,
 )
@@ -153,6 +154,9 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
             measurements, fit = _with_errors_of_scene(refined, kept, intervals, timing)
     known_std = displacement_std(fit, row_starts, timing.exposure_time)
     stated, if_hidden = with_further_tones(measurements, fit, row_starts, number_is_known=options.tones is not None)
+    if refined is not None:
+        apart, exposure = float(intervals[0]), timing.exposure_time
+        stated, if_hidden = (with_unknown_image_motion(one, apart, exposure) for one in (stated, if_hidden))
     vibration, std = stated.vibration()
     fit, std_if_hidden_tone = if_hidden.fit, if_hidden.vibration()[1]
 

@@ -66,6 +66,10 @@ _UNKNOWN_ALIASING = 3.0, 1.2
 # the value); of roll with paths of 1.5 and 2.8 px at half the width 2.2e-3 and 8e-3, 3.4 and 5.8 standard
 # deviations with the value of x and y
 _UNKNOWN_BLUR = 3e-5, 3e-5, 1e-3, 1e-3
+# px^-1 per frame, of the image motion along x and y, per square of the same path: with paths of 4 to 6 px, errors
+# along y were 3 to 31 thousandths of a pixel per frame (3 to 32 frames), up to 13 standard deviations without this
+# term, and are at most 2.6 (29 tones); along x 8 thousandths and less
+_DRIFT_BY_BLUR = 1e-4, 3e-4, 0.0, 0.0
 # Standard deviation of the errors of amplitudes that all rows have in common over the rms displacement of the rows that
 # nothing explains. Encoders predict blocks of a frame from others, with one displacement for all rows of a block. The
 # rms error of 26 to 35 amplitudes over their standard deviation, without and with it: H.264 of CRF 17, 20, 23, 28 in
@@ -249,7 +253,7 @@ def with_unknown_amplitudes(
     errors of the phase change the frequency.
     """
     size = fit.amplitude  # (B, A, K)
-    path = size * np.minimum(2 * math.pi * fit.frequencies * exposure_time, 2.0)
+    path = _path_within(fit, exposure_time)
     gain = np.maximum(offset_gain(fit.frequencies, intervals), 1e-3)
     error = np.array(_UNKNOWN_BLUR)[: size.shape[1], None] * np.square(path) * 2.0 / gain  # relative
     small, large = _UNKNOWN_ALIASING
@@ -272,6 +276,28 @@ def with_unknown_amplitudes(
     for axis in range(axes):
         of_axes[:, axis, :, axis] += unknown[:, axis, :, None] * unknown[:, axis, None]
     return replace(fit, covariance=covariance)
+
+
+def with_unknown_image_motion(stated: "StatedFit", interval: float, exposure_time: float) -> "StatedFit":
+    """The fit with errors of its image motion by blur, which displaces frames ``interval`` s apart by unequal amounts.
+
+    They are not part of the displacement of rows, whose errors are those without image motion.
+    """
+    fit, drifts = stated.fit, stated.fit.drift.shape[-1]
+    if drifts == 0:
+        return stated
+    axes = fit.amplitude.shape[1]
+    error = np.array(_DRIFT_BY_BLUR)[:axes] * np.square(_path_within(fit, exposure_time)).sum(-1) / interval  # px/s
+    covariance = fit.covariance.copy()
+    parameters = covariance.shape[-1] // axes
+    velocity = np.arange(axes) * parameters + parameters - drifts
+    covariance[:, velocity, velocity] += np.square(error)
+    return replace(stated, fit=replace(fit, covariance=covariance))
+
+
+def _path_within(fit: ToneFit, exposure_time: float) -> Array:
+    """(B, A, K) px, about how far each tone moves the rows within an exposure."""
+    return np.asarray(fit.amplitude * np.minimum(2 * math.pi * fit.frequencies * exposure_time, 2.0))
 
 
 # --- Further tones and slow errors ---
