@@ -97,7 +97,7 @@ def run(given: RunOptions) -> Answer:
         if given.report:
             pages = _write_page(folder, given, shown, answer)
             answers.check_folder(out, pages, overwrite=True, inputs=given.inputs)
-            names = pages + names
+            names = list(dict.fromkeys(pages + names))  # the page shows the curves of offsets.png as well
         elif result.restored:
             step = f"write a page with all figures:\n  {current_output().command} --resume --report"
             answer.next_steps.insert(0, step)
