@@ -166,14 +166,6 @@ class FreeMotionOptions(ProjectionOptions, RegistrationOptions, MaskedInputOptio
 
 
 @options
-class SweptToneOptions(RegistrationOptions, MaskedInputOptions):
-    """Options of ``detect_swept_tone``; bands are those of the start."""
-
-    iterations: int = Field(default=3, ge=1, le=100)
-    """Rounds of measuring and fitting."""
-
-
-@options
 class OffsetOptions(RegistrationOptions, MaskedInputOptions):
     """Options of functions that measure the offsets of row bands."""
 

@@ -54,7 +54,7 @@ from rsvib_torch.results.presentation import AXIS_NAMES, JudgedResult, axis_rows
 from rsvib_torch.results.reason import Findings, Reason
 from rsvib_torch.text import measured_text
 
-MAX_BAND_ERROR = 0.1  # px; smaller differences between the offsets of row bands and a motion are errors of registration
+_MAX_BAND_ERROR = 0.1  # px; smaller differences between the offsets of row bands and a motion are errors of bands
 _SECOND = (1.0, -2.0, 1.0)  # second difference
 _MAX_STD_SEEN = 0.3  # px, of the visible part of a reliable motion; frames of different scenes have more
 # rms of the part of a spline that all frames have in common over that of the rest. With frame_rows of the image height
@@ -220,7 +220,7 @@ def _detect(stack: GreyFrames, timing: SensorTiming, options: FreeMotionOptions,
     if not scale.same_for_all_columns:
         middle = torch.zeros(1, dtype=torch.float64, device="cpu")
         of_middle = ColumnMotion.of_columns(scale.free_motion(motion), middle, rowwise, len(starts), scale.height)
-    of_bands = bands_reasons(start, scale.width, of_middle[0], scale.axes)
+    of_bands = _bands_reasons(start, scale.width, of_middle[0], scale.axes)
     report = _report(free, spread, measured, timing, times, scale, of_bands, rows.differential()[0])
     return report.to(stack.images.device)
 
@@ -325,19 +325,12 @@ def _moved(measured: Measurements, motion: Motion) -> Array:
     return table(torch.stack(at_nodes, -1) @ shares)
 
 
-def band_errors(banded: Measurements, motion: Motion) -> list[float]:
-    """Mean difference in px of the offsets of the row bands of one stack from a motion in row order, for each axis."""
-    rest = _offsets_of_bands(banded, residual_of_motion(banded, motion))
-    best = np.sort(np.abs(rest), 0)[: math.ceil(0.75 * len(rest))]  # clouds may cover the others
-    return best.mean(0).tolist()
-
-
 def _offsets_of_bands(banded: Measurements, displacements: Array) -> Array:
     """(N, 2) px, offsets of the bands that were found from displacements (1, N, 2, 2)."""
     return np.diff(displacements[0], axis=1)[banded.weights[0].min(-1) > 0, 0]
 
 
-def bands_reasons(start: BandStart, columns: int, motion: Motion, axes: int = 2) -> list[list[Reason]]:
+def _bands_reasons(start: BandStart, columns: int, motion: Motion, axes: int = 2) -> list[list[Reason]]:
     """Reasons against a motion of each axis in row order that the row bands of one stack of ``columns`` px contradict.
 
     Noise without a scene has offsets of any size, and rows that are measured around a fit to them confirm it.
@@ -345,17 +338,13 @@ def bands_reasons(start: BandStart, columns: int, motion: Motion, axes: int = 2)
     banded = start.measurements
     values = _offsets_of_bands(banded, banded.displacements)
     size = np.abs(values - values.mean(0)).mean(0).tolist()
-    allowed = [max(MAX_BAND_ERROR, 0.3 * axis) for axis in size]  # px
-    compared = zip(AXIS_NAMES, band_errors(banded, motion), allowed, strict=False)
+    allowed = [max(_MAX_BAND_ERROR, 0.3 * axis) for axis in size]  # px
+    rest = _offsets_of_bands(banded, residual_of_motion(banded, motion))
+    best = np.sort(np.abs(rest), 0)[: math.ceil(0.75 * len(rest))]  # clouds may cover the others
+    compared = zip(AXIS_NAMES, best.mean(0).tolist(), allowed, strict=False)
     against = [[Reason("bands_contradict", *of_axis)] if of_axis[1] > of_axis[2] else [] for of_axis in compared]
     of_all = scene_reasons(start.curve, columns)[0]
     return [of_all + of_axis for of_axis in [*against, [], []][:axes]]
-
-
-def unexplained_reasons(axis: str, residual: float, moved: float, model: str) -> list[Reason]:
-    """Reasons against a fit whose rms ``residual`` in px exceeds 15 % of the rms motion ``moved``, and 0.03 px."""
-    allowed = max(0.15 * moved, 0.03)  # px
-    return [Reason("motion_unexplained", axis, residual, allowed, {"model": model})] if residual > allowed else []
 
 
 def _motion(fit: "_SplineFit", largest_drift: tuple[float, float] = (0.0, 0.0)) -> FreeMotion:
@@ -690,7 +679,10 @@ def _report(
     moved = (value - value.mean(0)).square().mean((0, 1)).sqrt()
     findings = []
     for axis, name in enumerate(AXIS_NAMES[: scale.axes]):
-        against = unexplained_reasons(name, float(rest[axis]), float(moved[axis]), "smooth motion") + of_bands[axis]
+        against, residual_of_axis = list(of_bands[axis]), float(rest[axis])
+        allowed = max(0.15 * float(moved[axis]), 0.03)  # px
+        if residual_of_axis > allowed:
+            against.insert(0, Reason("motion_unexplained", name, residual_of_axis, allowed))
         size = math.sqrt(2) * float(moved[axis] if scale.axes == 2 else moved[:2].amax())
         against += rotation_reasons(axis, scale.axes, apart.tolist(), size)
         if float(std_seen[axis]) > _MAX_STD_SEEN:
