@@ -191,7 +191,6 @@ class VibrationTracker:
         if timing.frame_start_times is not None:
             raise ValueError("timing must not have frame_start_times: pass the time of each frame to update")
         self.timing, self.options = timing, options
-        self.wobble = options.wobble or options.steady > 0
         self._rows = timing.in_row_order()
         self.reset()
 
@@ -504,7 +503,8 @@ class VibrationTracker:
             motion = motion_of_fit(replace(tones.fit, centre=tones.fit.centre - half), device)[0]
             # An axis moves if its tones were reliable in one of the last frames.
             trusted = tensor(np.any(track.trusted, 0)).to(device)
-            followed = ~trusted.new_tensor(contradicted_axes(tones.findings)) if self.wobble else trusted
+            is_followed = ~trusted.new_tensor(contradicted_axes(tones.findings))
+            followed = is_followed if self.options.steady else trusted
             motion = replace(motion.scaled(followed), amplitude=motion.amplitude * trusted[:, None])
             motion = motion.from_row_order(self.timing)
             place = state.path + track.filter.path(state.time + half - track.filter.time)
