@@ -179,8 +179,8 @@ class VibrationTracker:
         >>> tracker = rsv.VibrationTracker(timing, window=4)
         >>> for frame in frames:  # of a camera
         ...     tracked = tracker.update(frame)
-        >>> tracked.state, tracked.latency, tracked.restored.shape == frame.shape
-        ('tracking', 0, True)
+        >>> tracked.state, tracked.restored.shape == frame.shape
+        ('tracking', True)
         >>> tracked.detection.vibration.frequency[:, 0].round(decimals=1).tolist()
         [110.0, 90.0]
     """
