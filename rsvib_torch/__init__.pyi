@@ -18,10 +18,8 @@ from .augmentation import RollingShutterVibration as RollingShutterVibration
 from .detection import DetectionResult as DetectionResult
 from .detection import DisplacementSpectrum as DisplacementSpectrum
 from .detection import MotionDetection as MotionDetection
-from .detection import SweptTone as SweptTone
 from .detection import VibrationDetector as VibrationDetector
 from .detection import detect_motion as detect_motion
-from .detection import detect_swept_tone as detect_swept_tone
 from .detection import detect_vibration as detect_vibration
 from .evaluation import MtfCurve as MtfCurve
 from .evaluation import psnr as psnr

@@ -166,14 +166,6 @@ class FreeMotionOptions(ProjectionOptions, RegistrationOptions, MaskedInputOptio
 
 
 @options
-class SweptToneOptions(RegistrationOptions, MaskedInputOptions):
-    """Options of ``detect_swept_tone``; bands are those of the start."""
-
-    iterations: int = Field(default=3, ge=1, le=100)
-    """Rounds of measuring and fitting."""
-
-
-@options
 class OffsetOptions(RegistrationOptions, MaskedInputOptions):
     """Options of functions that measure the offsets of row bands."""
 
@@ -351,10 +343,7 @@ class TrackerOptions(RestorationOptions, InputOptions):
     """Method of ``restore``; ``"dewarp"`` is the fastest."""
     steady: NotNegative = 0.0
     """s; the image is moved to the straight line that fits its path during this time, so that slow shaking is removed
-    as well. 0: frames stay where they are."""
-    wobble: bool = False
-    """Whether skew and wobble by slow motion are removed along axes without a reliable vibration as well, as with
-    ``steady``. Frames that move as a whole (stabilised in the camera) would be skewed by it."""
+    as well, and its skew and wobble also along axes without a reliable vibration. 0: frames stay where they are."""
 
 
 @options

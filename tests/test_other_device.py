@@ -79,7 +79,6 @@ WORK = {
         rsv.detect_vibration(images[None, :, None].expand(2, -1, -1, -1, -1), timing).vibration
     ),
     "free": lambda images, timing: rsv.detect_motion(images, timing).motion,
-    "swept": lambda images, timing: rsv.detect_swept_tone(images, timing).amplitude,
     "exact": lambda images, timing: rsv.restore(images, timing, SHAKE),
     "exact, segments": lambda images, timing: rsv.restore(images, timing, SHAKE, segments=2, chunk_frequencies=16),
     "exact, long exposures": lambda images, timing: rsv.restore(images, timing, SHAKE),

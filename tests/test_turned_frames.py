@@ -69,7 +69,6 @@ FUNCTIONS = {
     "detect_vibration": (lambda f, t, _: detected(f, t, "direct"), 3e-3, True),
     "detect_vibration, bands": (lambda f, t, _: detected(f, t, "bands"), 1e-3, True),
     "detect_motion": (free, 1e-3, True),
-    "detect_swept_tone": (lambda f, t, _: {"vector": moved(rsv.detect_swept_tone(f, t).motion)}, 1e-4, True),
     "follow_vibration": (followed, 1e-3, True),
     "tracker": (tracked, 1e-4, False),
     "judge_restoration": (judged, 1e-3, False),

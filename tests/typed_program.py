@@ -22,7 +22,7 @@ rsv.restore(frames, timing, still, half_rows="x")  # type: ignore[arg-type]
 rsv.restore(frames, timing, still, method="magic")  # type: ignore[arg-type]
 rsv.register_bands(frames, timing, band_row=3)  # type: ignore[call-arg]
 rsv.VibrationTracker(timing, window=4.5)  # type: ignore[arg-type]
-rsv.detect_swept_tone(frames, timing, tones=2)  # type: ignore[call-arg]
+rsv.detect_motion(frames, timing, tones=2)  # type: ignore[call-arg]
 
 # Functions of rows require a timing in row order.
 row, start = frames[0, :, 0], frames[0, 0, 0]

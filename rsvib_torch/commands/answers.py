@@ -38,7 +38,7 @@ def detection_data(result: detection.DetectionResult) -> Table:
 
 
 def verdicts(
-    found: Sequence[DetectedVibration | detection.MotionDetection | detection.SweptTone | None],
+    found: Sequence[DetectedVibration | detection.MotionDetection | None],
 ) -> dict[str, bool]:
     """Whether each axis is reliable in all detections; None is one that failed."""
     flags = [[] if one is None else one.reliable.tolist() for one in found]

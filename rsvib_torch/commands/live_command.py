@@ -71,7 +71,6 @@ def live_session(given: LiveOptions) -> Answer:
             settings.timing,
             **restoration | given.tracker | {"method": method},
             steady=given.steady,
-            wobble=given.steady > 0,
             full_scale=source.full_scale if given.full_scale is None or file else given.full_scale,
             channels="first",
         )

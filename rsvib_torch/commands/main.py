@@ -43,7 +43,7 @@ _EXAMPLES = """
   rsvib restore frames.tif restored.tif --config camera.toml \\
         --vibration found/vibration.json
   rsvib motion frames.tif --config camera.toml --out motion.csv
-  rsvib motion frames.tif --config camera.toml --out swept.csv --model swept
+  rsvib motion frames.tif --config camera.toml --out motion.csv --knot-rows 12
   rsvib restore frames.tif restored.tif --config camera.toml \\
         --motion gyroscope.csv --unit rad/s --focal-length 1800
   rsvib calibrate led.mp4 --frequency 1000 --frame-rate 29.97 \\

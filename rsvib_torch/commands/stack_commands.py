@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import rsvib_torch
 from rsvib_torch import detection, io, stacks
@@ -85,10 +85,7 @@ class MotionOptions(shared.StackCommand, shared.VerdictOptions):
     """Options of ``motion``."""
 
     out: Path = option(...)
-    """CSV file to write: time in s, x and y in px, and their standard deviations (model free)."""
-    model: Literal["free", "swept"] = "free"
-    """free: a smooth curve of any shape; swept: one sinusoid per axis whose amplitude decays or grows and whose
-    frequency changes linearly."""
+    """CSV file to write: time in s, x and y in px, and their standard deviations."""
     detection: Annotated[Table, Given(FreeMotionOptions, ("knot_rows", "search"))]
 
 
@@ -99,14 +96,9 @@ def motion(given: MotionOptions) -> Answer:
     """
     out, frames = given.out, given.frames
     shared.check_file(out, given.overwrite, given.inputs)
-    chosen = {name: value for name, value in given.detection.items() if given.model == "free" or name == "search"}
     pixels, timing = load(given)
-    result: detection.MotionDetection | detection.SweptTone
     with working("detecting the motion"):
-        if given.model == "free":
-            result = detection.detect_motion(pixels, timing, **chosen)
-        else:
-            result = detection.detect_swept_tone(pixels, timing, **chosen)
+        result = detection.detect_motion(pixels, timing, **given.detection)
     columns = reports.motion_columns(result, timing)
     reports.write_columns(out, columns)
     known_motion = ("--motion", out, "--unit", "px", "--offset", "0")

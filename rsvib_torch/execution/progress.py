@@ -36,11 +36,3 @@ def steps(total: int, unit: str) -> Callable[..., None]:
 
     advance(0)
     return advance
-
-
-@contextmanager
-def whole_steps(total: int, unit: str) -> Iterator[Callable[..., None]]:
-    """``steps`` of a loop whose steps take about the same time; loops within them report nothing."""
-    advance = steps(total, unit)
-    with listening(lambda *_: None):
-        yield advance

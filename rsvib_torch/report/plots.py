@@ -331,16 +331,12 @@ def motion_figure(motion: Motion, first: float = 0.0, last: float | None = None)
     return figure
 
 
-def _detected_motion_figure(result: detection.MotionDetection | detection.SweptTone) -> Figure:
-    """Draw a swept tone, or a free motion at the rows of the frames with a band of two standard deviations."""
-    if isinstance(result, detection.SweptTone):
-        figure = motion_figure(result.motion)
-        panel = figure.axes[0]
-    else:
-        figure, ((panel,),) = _panels(8, 3.6)
-        for frame, (times, *values) in enumerate(zip(result.times, result.displacement, result.std, strict=True)):
-            _plot_axes(panel, 1e3 * times, *values, legend=frame == 0)
-        plain_axes(panel, "time (ms)", "displacement (px)")
+def _detected_motion_figure(result: detection.MotionDetection) -> Figure:
+    """Draw a free motion at the rows of the frames with a band of two standard deviations."""
+    figure, ((panel,),) = _panels(8, 3.6)
+    for frame, (times, *values) in enumerate(zip(result.times, result.displacement, result.std, strict=True)):
+        _plot_axes(panel, 1e3 * times, *values, legend=frame == 0)
+    plain_axes(panel, "time (ms)", "displacement (px)")
     lines = [  # which axes are not reliable, with the first reason
         textwrap.shorten(f"{name}: not reliable: {reasons[0]}", 100, placeholder=" …")
         for name, good, reasons in zip("xy", result.reliable, result.reasons, strict=True)
@@ -625,7 +621,6 @@ FIGURES.update(
         ),
         (detection.DisplacementSpectrum, 0): _spectrum_figure,
         (detection.MotionDetection, 0): _detected_motion_figure,
-        (detection.SweptTone, 0): _detected_motion_figure,
         (RowTimeCalibration, 0): _calibration_figure,
         (gyroscope.ClockAlignment, 0): lambda result: motion_figure(result.motion),
         (gyroscope.RotationAlignment, 0): _rotation_figure,

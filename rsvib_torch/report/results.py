@@ -14,7 +14,7 @@ from torch import Tensor
 from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.validation import read_json
 from rsvib_torch.checks.values import check_single
-from rsvib_torch.detection import DetectionResult, MotionDetection, SweptTone
+from rsvib_torch.detection import DetectionResult, MotionDetection
 from rsvib_torch.files.atomic import whole_file, write_json
 from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.timing import SensorTiming
@@ -128,21 +128,16 @@ def write_table(path: str | os.PathLike[str], result: Result, *, pixel_size: flo
     write_columns(path, result.table(pixel_size=pixel_size))
 
 
-def motion_columns(result: MotionDetection | SweptTone, timing: SensorTiming) -> dict[str, list[str]]:
-    """Columns of a table of a motion: time in s, x and y in px, and of a free motion their standard deviations.
-
-    At equidistant times: twice per knot of a free motion, once per knot of a swept tone.
-    """
-    curve, end, spacing = result.motion, result.motion.end, result.motion.spacing
-    if isinstance(result, MotionDetection):
-        end, spacing = max(end, float(result.times.max()) + timing.exposure_time), 0.5 * spacing
-    steps = math.ceil((end - curve.start) / spacing)
+def motion_columns(result: MotionDetection, timing: SensorTiming) -> dict[str, list[str]]:
+    """Columns of a table of a motion at equidistant times, two per knot: time in s, x and y and their std in px."""
+    curve = result.motion
+    end = max(curve.end, float(result.times.max()) + timing.exposure_time)
+    steps = math.ceil((end - curve.start) / (0.5 * curve.spacing))
     times = torch.linspace(curve.start, end, steps + 1, dtype=torch.float64, device=curve.device)
     moved, at = curve.displacement(times).cpu().numpy(), times.cpu().numpy()
+    rows, stds = result.times.flatten().cpu(), result.std.flatten(0, 1).cpu()
     columns = {"time": at, "x": moved[:, 0], "y": moved[:, 1]}
-    if isinstance(result, MotionDetection):
-        rows, stds = result.times.flatten().cpu(), result.std.flatten(0, 1).cpu()
-        columns |= {f"std_{name}": np.interp(at, rows, stds[:, axis]) for axis, name in enumerate("xy")}
+    columns |= {f"std_{name}": np.interp(at, rows, stds[:, axis]) for axis, name in enumerate("xy")}
     return {name: [f"{v:.{9 if name == 'time' else 5}f}" for v in values] for name, values in columns.items()}
 
 

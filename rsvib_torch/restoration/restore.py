@@ -98,7 +98,7 @@ def restore(
         timing: The sensor.
         vibration: The motion in image axes: one for all, or a batch (B,) for a batch of stacks. Or a
             ``DetectionResult``: axes without a reliable vibration are then not corrected, see ``trusted_vibration``.
-            The results of the free and the swept model contain the motion as ``.motion``.
+            The result of ``detect_motion`` contains the motion as ``.motion``.
         options: Options, see ``RestoreOptions``.
 
     Returns:

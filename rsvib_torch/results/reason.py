@@ -337,7 +337,7 @@ _SHAPES = {
         "tenth or more",
     ),
     "motion_unexplained": _px(
-        "rows move by {value:.3g} px that no {model} explains, {limit:.2g} px are allowed",
+        "rows move by {value:.3g} px that no smooth motion explains, {limit:.2g} px are allowed",
         compares="rms residual of the rows, above 15 % of their motion and 0.03 px",
     ),
     "bands_contradict": _px(
@@ -360,24 +360,6 @@ _SHAPES = {
         "between them: a tone near a multiple of the frame rate, or a wrong frame_rows",
         "check that frame_rows counts the blanking rows, or measure tones with detect_vibration",
         compares="rms of the common part of the motion, above ten times that of the rest",
-    ),
-    "too_few_frames_for_sweep": ReasonKind(
-        "{value:g} frames do not determine decay and sweep of a tone, {limit:g} are needed: several swept tones fit",
-        "use more frames, or a steady tone (detect_vibration)",
-        "number of frames, below 3",
-    ),
-    "other_axis_unknown": ReasonKind(
-        "rows move along {other} by a motion that is not known, which displaces what they show of {axis}", _MORE_FRAMES
-    ),
-    "tone_of_chance": ReasonKind(
-        "the best of so many tones explains as much of noise with a probability of {value:.2g}, {limit:g} is allowed",
-        _MORE_FRAMES,
-        "probability that noise in the offsets of row bands is explained as well, above 0.01",
-    ),
-    "other_swept_tone": ReasonKind(
-        "another tone fits the rows as well: {frequency:.4g} Hz with a decay of {decay:.3g} /s in the middle of the "
-        "record",
-        _MORE_FRAMES,
     ),
 }
 _RECORDED = {
@@ -513,7 +495,7 @@ _RESTORATION = {
 GROUPS = {
     "Tones (`detect_vibration`)": _TONES,
     "A vibration that is followed (`follow_vibration`)": _FOLLOWED,
-    "Other motions (`detect_motion`, `detect_swept_tone`)": _SHAPES,
+    "Other motions (`detect_motion`)": _SHAPES,
     "Recorded motions (`align_motion`, `check_motion`)": _RECORDED,
     "Row time (`calibrate_row_time_by_motion`)": _ROW_TIME,
     "Restoration (`restore`, `judge_restoration`)": _RESTORATION,

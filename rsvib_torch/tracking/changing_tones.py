@@ -3,7 +3,7 @@
 The displacement along an axis is ``Re sum_k C_k(t) exp(2 pi i f_k t) + D(t)``, in which the C_k and the velocity of D
 are straight between knots. It is linear for given frequencies, so that all frequencies are tried, one tone after
 another. The offsets of the whole record distinguish frequencies that differ by multiples of the frame rate, which a
-few frames of a tone that decays do not. Where one model does not explain the offsets, a vibration may change suddenly.
+few frames of a tone that decays do not.
 """
 
 import math
@@ -13,7 +13,6 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
-from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
@@ -32,7 +31,6 @@ _STEPS = 3.0  # frequencies that are tried for each inverse distance of the knot
 _MIN_SIZE, _MIN_SIZE_OF_ROWS = 0.02, 0.1
 # of the largest offsets of a pair, those of a pair at rest, and by how many times these its neighbours exceed it
 _AT_REST, _SUDDEN = 0.05, 5.0
-_SPLITS = 16  # frames that are tried first as the one of a sudden change
 _MIN_BETTER = 25.0  # decrease of chi-square by which a tone must be better than one at another frequency
 
 
@@ -46,8 +44,6 @@ class ChangingTones:
         coefficients: (K, J) complex px, ``C_k`` at the knots.
         velocity: (J,) px/s at the knots.
         other: Hz, frequency of another tone that explains the offsets as well as one of these; None if there is none.
-        misfit: Sum of the weighted squares of what is left of the offsets.
-        parameters: Number of parameters of the fit.
     """
 
     knots: Array
@@ -55,8 +51,6 @@ class ChangingTones:
     coefficients: Array
     velocity: Array
     other: float | None
-    misfit: float
-    parameters: int
 
     def missing(self, found: "ChangingTones", slowest: float) -> float | None:
         """Hz, the frequency of a tone of ``found`` above ``slowest`` that is none of these; None if there is none.
@@ -147,51 +141,14 @@ def tones_of_rows(
 def of_frames(curve: OffsetCurve, frames: slice) -> OffsetCurve:
     """The offsets between some frames."""
     used = (curve.pairs[:, 0] >= frames.start) & (curve.pairs[:, 1] < frames.stop)
-    return replace(_of_pairs(curve, used), pairs=curve.pairs[used] - frames.start)
-
-
-def _of_pairs(curve: OffsetCurve, used: Tensor) -> OffsetCurve:
     return replace(
         curve,
-        pairs=curve.pairs[used],
+        pairs=curve.pairs[used] - frames.start,
         times=curve.times[used],
         later_times=curve.later_times[used],
         offsets=curve.offsets[:, used],
         quality=curve.quality[:, used],
     )
-
-
-def sudden_change(curve: OffsetCurve, starts: Array, rows: RowTiming, bands: RegistrationOptions) -> int | None:
-    """The frame in which the vibration changes suddenly; None if no frame divides the record better than noise.
-
-    The frames before and behind it have tones of their own; the two pairs of the frame itself belong to neither.
-    """
-    number = len(starts)
-
-    def fit(part: OffsetCurve, frames: slice) -> Array:
-        """Misfit and number of parameters of both axes."""
-        tones = changing_tones(part, starts[frames], rows, bands)
-        return np.array([(one.misfit, one.parameters) for one in tones]).sum(0)
-
-    def divided(frame: int) -> Array:
-        return sum((fit(of_frames(curve, of), of) for of in (slice(0, frame), slice(frame + 1, number))), np.zeros(2))
-
-    # 1. The frame that leaves least, from coarse to fine.
-    step, possible = 1 + number // _SPLITS, range(2, number - 2)
-    found = {frame: divided(frame) for frame in possible[::step]}
-    while found and step > 1:
-        step //= 2
-        best = min(found, key=lambda frame: found[frame][0])
-        found |= {frame: divided(frame) for frame in (best - step, best + step) if frame in possible}
-    if not found:
-        return None
-    best = min(found, key=lambda frame: found[frame][0])
-    # 2. Is this better than no change, in the same pairs?
-    beside = _of_pairs(curve, (curve.pairs != best).all(-1))
-    (misfit, parameters), (of_whole, fewer) = found[best], fit(beside, slice(0, number))
-    noise = misfit / max(beside.offsets[0].numel() - parameters, 1)
-    added = max(parameters - fewer, 4 + 2 * number / _KNOT_FRAMES)
-    return best if of_whole - misfit > F_THRESHOLD * noise * added else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,8 +283,5 @@ class _AxisOffsets:
         kept = np.prod([np.sinc(frequencies * seconds) for seconds in self.record.averaged], 0)
         coefficients = coefficients / np.maximum(kept, 0.1)[:, None]
         explained = columns @ solved / np.sqrt(np.maximum(self.weights, 1e-300))
-        misfit = float(np.square(self.data - columns @ solved).sum())
-        tones = ChangingTones(
-            self.record.knots, frequencies, coefficients, solved[:count], other, misfit, columns.shape[1]
-        )
+        tones = ChangingTones(self.record.knots, frequencies, coefficients, solved[:count], other)
         return tones, np.where(self.weights > 0, explained, 0.0)

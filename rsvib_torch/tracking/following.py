@@ -39,7 +39,6 @@ from rsvib_torch.tracking.changing_tones import (
     changing_tones,
     moving_parts,
     of_frames,
-    sudden_change,
     tones_of_rows,
 )
 from rsvib_torch.tracking.tone_filter import ToneFilter
@@ -48,7 +47,6 @@ from rsvib_torch.tracking.tracker import PATIENCE, TrackerState, VibrationTracke
 
 _BANDS = RegistrationOptions()
 _SLOWEST = 1.25  # frame rates; slower tones are not distinguished from a drift that changes, which trackers follow
-_MIN_FRAMES = 4  # before or behind a sudden change
 _BEGIN = 3  # frames at the start of a tracker, whose rows are measured around a less accurate motion
 _TONE = ("amplitude", "frequency", "phase")
 _DRIFT = ("image_motion", "image_acceleration")
@@ -212,15 +210,6 @@ def _followed_part(
         if last or missing == [None, None]:
             break
         tones = [known if one is None else other for known, other, one in zip(tones, found, missing, strict=True)]
-    # 5. Where few frames are known, the vibration may change suddenly: the frames before and behind it on their own.
-    few_known = max(map(_num_reliable, results)) < number
-    changed = sudden_change(curve, starts, rows, _BANDS) if few_known else None
-    if changed is not None:
-        divided = [_unknown("not_followed") for _ in range(number)]
-        for part in (slice(0, changed), slice(changed + 1, number)):
-            if part.stop - part.start >= _MIN_FRAMES:
-                divided[part] = _followed_part(images[part], starts[part], of_frames(curve, part), rows, options)
-        results.append(divided)
     return max(results, key=_num_reliable)
 
 

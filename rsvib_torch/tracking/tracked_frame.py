@@ -82,7 +82,6 @@ class TrackedFrame:
         options: Options of the tracker.
         lost: Why the motion that was followed until the frame before is not known any more, or that it cannot be found
             because the times contradict the frame period; otherwise empty.
-        latency: Number of frames that were given after this one.
     """
 
     time: float
@@ -95,7 +94,6 @@ class TrackedFrame:
     tones: TrackedTones | None
     options: TrackerOptions
     lost: str = ""
-    latency: int = 0
 
     def moved_to(self, place: Tensor) -> "TrackedFrame":
         """The same frame with its content at another place (2,) of the path in px, to stabilise a video.

@@ -73,7 +73,6 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     frames = rsv.simulate_frames(scene, timing, vibration, 3, frame_size=(96, 64))
     detected = rsv.detect_vibration(frames, timing, **DETECTION)
     free = rsv.detect_motion(frames, timing, **BANDS)
-    swept = rsv.detect_swept_tone(frames, timing, **BANDS)
     restored = rsv.restore(frames, timing, vibration, method="dewarp", check=False)
     rows, columns = torch.meshgrid(torch.arange(64.0), torch.arange(48.0), indexing="ij")
     edge = torch.sigmoid((columns - 24 - 0.1 * (rows - 32)) / 0.7) * 0.6 + 0.2
@@ -160,7 +159,6 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
         "calibrate_row_time_by_motion": {"row_time": (5e-5, 2e-4)},
         "comparison_figure": {"size": 32, "restored": restored[0]},
         "detect_motion": {"iterations": 1},
-        "detect_swept_tone": {"iterations": 1},
         "detect_vibration": fast,
         "iterate_stack": windows,
         "motion_figure": {"motion": vibration, "last": 0.1},
@@ -220,7 +218,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     described += (detected.spectrum(), rsv.CameraMode("A", "B", "", 1920, 1080, 30.0, 0.01, 1e-4, 3, "forward", 1080))
     of_frame = {one.name: getattr(detected, one.name) for one in fields(rsv.FollowedVibration) if one.name != "times"}
     described += (rsv.FollowedVibration(**of_frame, times=times[0]),)
-    described += (detected, detected.offsets, free, swept, check, alignment, rates, rotation)
+    described += (detected, detected.offsets, free, check, alignment, rates, rotation)
     for value in described:
         result[type(value).__name__] = _with_fields(value)
     for value in (vibration, recorded, timing, *described):

@@ -17,7 +17,7 @@ from torch import Tensor
 
 import rsvib_torch as rsv
 
-_FUNCTIONS = (rsv.detect_vibration, rsv.detect_motion, rsv.detect_swept_tone)
+_FUNCTIONS = (rsv.detect_vibration, rsv.detect_motion)
 _SIZE = 128  # px
 # images of rows y, columns x and a random number n, which move by a few px per frame
 _IMAGES: dict[str, Callable[[Tensor, Tensor, int], Tensor]] = {

@@ -79,7 +79,6 @@ ORIGINALS: dict[str, Callable[[Path], Any]] = {
     "vibration.json": lambda path: str(read_vibration(path, TIMING)),
     "detection.json": lambda path: str(rsv.DetectionResult.load(path)),
     "free.json": lambda path: str(rsv.FreeMotion.load(path)),
-    "swept.json": lambda path: str(rsv.SweptTone.load(path)),
 }
 
 
@@ -112,7 +111,6 @@ def write_originals(folder: Path) -> dict[str, bytes]:
     detected.save(folder / "vibration.json")
     detected.save(folder / "detection.json")
     rsv.detect_motion(frames, TIMING, **BANDS).motion.save(folder / "free.json")
-    rsv.detect_swept_tone(frames, TIMING, **BANDS).save(folder / "swept.json")
     lines = [f"{0.001 * i:.3f},{0.1 * i:.2f},{-0.1 * i:.2f}" for i in range(40)]
     (folder / "motion.csv").write_text("\n".join(["time,x,y", *lines]))
     head = ["GYROFLOW IMU LOG", "version,1.3", "orientation,YxZ", "tscale,1", "gscale,1", "t,gx,gy,gz"]

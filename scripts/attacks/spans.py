@@ -14,7 +14,7 @@ from small_stack import TIMING
 
 import rsvib_torch as rsv
 
-_FUNCTIONS = ("detect_vibration", "detect_motion", "detect_swept_tone", "tracker", "restore")
+_FUNCTIONS = ("detect_vibration", "detect_motion", "tracker", "restore")
 _UNITS = (1.0, 1.0, 1e3, 1e6, 1e9, 1e12)  # factors of the stated times; 1: they are true
 _TRUE = torch.tensor([[130.0], [170.0]], dtype=torch.float64)  # Hz, of ``vibrating_counts``
 

@@ -33,14 +33,6 @@ STD = rsv.VibrationStd(NO_TONE, NO_TONE, NO_TONE, NO_TONE, torch.zeros(2), torch
 CURVE = rsv.OffsetCurve(
     torch.tensor([[0, 1]]), torch.arange(3), PAIR, PAIR + 0.01, torch.zeros(1, 3, 2), PAIR + 1, (16, 16)
 )
-SWEPT = rsv.SweptTone(
-    *[torch.zeros(2)] * 6,
-    {name: torch.ones(2) for name in ("amplitude", "frequency", "decay", "chirp", "phase")},
-    rsv.FreeMotion(torch.zeros(2, 9), 0.0, 1e-3),
-    torch.zeros(2),
-    torch.ones(2, dtype=torch.bool),
-    ((), ()),
-)
 
 
 def blur():
@@ -153,10 +145,6 @@ def test_pixels_beyond_all_scales(value):
         (lambda: rsv.comparison_figure(FRAMES[0], FRAMES[None]), r"restored must have shape \(C, H, W\) with C = 1"),
         (lambda: rsv.calibrate_row_time(STRIPES, 1000.0, frame_rate=1e-40), "flicker_frequency=1000 Hz is ambiguous"),
         (lambda: rsv.row_psf(rsv.Vibration(1e6, 50.0), STARTS, TIMING), r"96 rows, .* GB .* check amplitude"),
-        (
-            lambda: rsv.detect_swept_tone(FRAMES[:1].expand(2, 96, 64), LONG, **BANDS),
-            "frames cover 2.01 s; starts of the swept model .* at most .* s: pass larger band_rows",
-        ),
         (lambda: restore(method="banded", noise_to_signal=1e300), r"noise_to_signal must be at most 1e\+15"),
         (lambda: VIBRATION.expanded(10**9), "size must be at most"),
         (lambda: rsv.SensorNoise(5000.0).apply(FRAMES / 0), r"frames must be finite, but pixel \(0, 0, 0\) is inf"),
@@ -249,7 +237,6 @@ def test_pixels_beyond_all_scales(value):
         (lambda: restore(ignore=FRAMES), "ignore must be a bool tensor, got torch.float32"),
         (lambda: restore(saturation=1e-9), "every pixel is saturated"),
         (lambda: rsv.detect_motion(FRAMES[:1], TIMING), "at least 2 frames"),
-        (lambda: rsv.detect_swept_tone(FRAMES[:1], TIMING), "at least 2 frames"),
         (lambda: rsv.restore(FRAMES, TIMING, rsv.Vibration.still((3,))), r"vibration of batch shape \(3,\) does"),
         (lambda: rsv.restore(FRAMES, TIMING, rsv.Vibration(1.0, 5e7)), "periods while a row is exposed"),
         (lambda: restore(half_row=2), "unknown option 'half_row'; the options are .*regularisation"),
@@ -332,12 +319,10 @@ def test_values_beyond_the_limits_of_an_argument(build, message):
     [
         ("std", {"amplitude": torch.zeros(4, 2, 1)}, r"frequency must have shape .* with \.\.\. = \(4,\), A = 2, K ="),
         ("curve", {"times": torch.zeros(4, 1, 3)}, r"times must have shape .* with \.\.\. = \(\), P = 1, N = 3"),
-        ("swept", {"reliable": torch.ones(1, 2, dtype=torch.bool)}, r"reliable must have shape .* with \.\.\. = \(\)"),
-        ("swept", {"std": {"a": 1}}, r"std.a must be an instance of Tensor, got 1 \(int\)"),
     ],
 )
 def test_results_of_contradicting_shapes(result, changes, message):
-    results = {"std": STD, "curve": CURVE, "swept": SWEPT}
+    results = {"std": STD, "curve": CURVE}
     assert str(replace(results[result]))
     with pytest.raises((TypeError, ValueError), match=message):
         replace(results[result], **changes)

@@ -98,7 +98,7 @@ FRAMES = {
 
 
 @pytest.mark.parametrize("name", FRAMES)
-@pytest.mark.parametrize("function", [rsv.detect_vibration, rsv.detect_motion, rsv.detect_swept_tone])
+@pytest.mark.parametrize("function", [rsv.detect_vibration, rsv.detect_motion])
 def test_frames_that_do_not_determine_a_motion(function, name):
     reliable = torch.tensor(False)
     with suppress(ValueError):

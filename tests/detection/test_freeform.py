@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from motion_truth import offset_error, rms
+from scipy.optimize import curve_fit
 from truth import MARGIN, Curve, recorded
 
 import rsvib_torch as rsv
@@ -168,3 +169,30 @@ def test_a_common_part_that_is_not_known_is_refused():
     fast = Curve(lambda t: np.stack([1.5 * np.sin(14.5 * t / period), np.sin(11.6 * t / period + 1.0)], -1))
     found = rsv.detect_motion(recorded((HEIGHT, 112), TIMING, fast, 2, 0.005, seed=12), TIMING)
     assert [of_axis[0].code for of_axis in found.findings] == ["common_motion_uncertain"] * 2
+
+
+@pytest.mark.parametrize("count", [3, 5])
+def test_a_tone_that_decays_and_sweeps_is_fitted_to_what_differs_between_frames(count):
+    """As on the page on cameras: the part that all frames have in common, which is estimated, is left out."""
+
+    def tone(t, a, b, frequency, decay, sweep):
+        angle = 2 * np.pi * (frequency + 0.5 * sweep * t) * t
+        return np.exp(-decay * t) * (a * np.sin(angle) + b * np.cos(angle))
+
+    along = {0: (2.6, 1.8, 83.0, 25.0, 0.0), 1: (0.5, -1.0, 30.0, 0.0, 520.0)}
+    swept = Curve(lambda t: np.stack([tone(t, *along[0]), tone(t, *along[1])], -1))
+    found = rsv.detect_motion(recorded((HEIGHT, WIDTH), TIMING, swept, count, 0.005, seed=6), TIMING)
+    times = found.times.numpy()
+
+    def between_frames(_, speed, *values):
+        moved = tone(times, *values) + speed * times
+        return (moved - moved.mean(0)).ravel()
+
+    assert found.reliable.all()
+    for axis, true in along.items():
+        moved = found.displacement[..., axis].numpy()
+        start = [0, 1, 1, 1.03 * true[2], 0.9 * true[3], 0.9 * true[4]]
+        values, _ = curve_fit(between_frames, None, (moved - moved.mean(0)).ravel(), start)
+        error = tone(times, *values[1:]) + values[0] * times - tone(times, *true)
+        assert (error - error.mean()).std() < 0.02
+        assert values[3] == pytest.approx(true[2], abs=0.5)

@@ -67,7 +67,6 @@ def make_results(frames, detection, windows):
         windows.offsets,
         free,
         free.motion,
-        rsv.detect_swept_tone(frames, TIMING),
         rsv.judge_restoration(frames, restored, TIMING, detection),
         rsv.check_motion(frames, TIMING, detection.vibration),
         rsv.align_motion(frames, TIMING, recording(), fit_scale=False),

@@ -115,21 +115,15 @@ def test_the_frames_before_a_vibration_stops_are_restored(tmp_path):
     assert [one.code for one in found.findings[15][0]] == ["no_tone"]
 
 
-def test_the_frames_before_and_behind_a_change_of_frequency_are_followed():
-    """No tones of the whole record explain a motor that changes its speed within frame 10."""
+def test_a_change_of_frequency_within_the_record_is_refused():
+    """No tones explain a motor that changes its speed within frame 10."""
 
     def moved(times):
         turned = 2 * np.pi * np.where(times < 10.4 * TIMING.frame_period, 0.0, [[-28.3], [-9.0]]).T
         return AMPLITUDE * np.sin(turned * times[..., None] + 2 * np.pi * FREQUENCY * times[..., None] + PHASE)
 
     found = rsv.follow_vibration(take_frames(SCENE, TIMING, Curve(moved), 20, noise=0.003), TIMING)
-    reliable = found.reliable.numpy()
-    assert reliable.sum(0).tolist() == [19, 19]
-    assert not reliable[10].any()
-    speeds = np.where(np.arange(20)[:, None] < 10, FREQUENCY, FREQUENCY - [28.3, 9.0])
-    assert np.abs(scores(found, "frequency", speeds)).max() < 3
-    amplitude = found.vibration.amplitude[..., 0].numpy()
-    assert np.abs(amplitude - AMPLITUDE)[reliable].max() < 0.05
+    assert not found.reliable.any()
 
 
 def test_a_frame_at_rest_contradicts_the_tones_of_the_others():

@@ -1,1 +1,1 @@
-"""Detection of motions of other shapes: free motion (spline in time) and swept tones."""
+"""Detection of motions of other shapes: free motion (spline in time)."""

@@ -9,7 +9,6 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,7 +23,6 @@ from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
 from rsvib_torch.detection.rows.grouped_frames import (
     GroupedFrames,
-    GroupedStrips,
     MeasuredRows,
     grouped_frames,
     grouped_strips,
@@ -54,7 +52,7 @@ from rsvib_torch.results.presentation import AXIS_NAMES, JudgedResult, axis_rows
 from rsvib_torch.results.reason import Findings, Reason
 from rsvib_torch.text import measured_text
 
-MAX_BAND_ERROR = 0.1  # px; smaller differences between the offsets of row bands and a motion are errors of registration
+_MAX_BAND_ERROR = 0.1  # px; smaller differences between the offsets of row bands and a motion are errors of bands
 _SECOND = (1.0, -2.0, 1.0)  # second difference
 _MAX_STD_SEEN = 0.3  # px, of the visible part of a reliable motion; frames of different scenes have more
 # rms of the part of a spline that all frames have in common over that of the rest. With frame_rows of the image height
@@ -191,9 +189,15 @@ def _detect(stack: GreyFrames, timing: SensorTiming, options: FreeMotionOptions,
     longest, knot_rows = math.floor((record[1] - record[0]) / rowwise.row_time), options.knot_rows
     if knot_rows > longest:
         raise ValueError(f"knot_rows must be at most {longest}, the row times of the stack, got {knot_rows}")
-    rows, motion = measure_freely(stack, rowwise, start.measurements, knot_rows, options.iterations)
+    spacing = max(knot_rows * rowwise.row_time, (record[1] - record[0]) / 3000)  # s; the cost grows with knots^3
+    motion = _motion(_fit_spline(start.measurements, max(spacing, 0.5 * start.measurements.average_times[0]), record))
+    rows, motion = _measured_around(motion, stack, rowwise, spacing, options.iterations, None)
     if not scale.same_for_all_columns:
-        rows, motion = _measure_field(stack, rowwise, motion, scale, options.iterations)
+        still = torch.zeros_like(motion.coefficients[:, :1]).expand(-1, scale.axes - 2, -1)
+        drift = functional.pad(motion.tones.image_motion, (0, scale.axes - 2))
+        drifting = Vibration(torch.zeros(1, scale.axes, 1), 0.0, 0.0, drift)
+        motion = FreeMotion(torch.cat([motion.coefficients, still], 1), motion.start, motion.spacing, drifting)
+        rows, motion = _measured_around(motion, stack, rowwise, spacing, options.iterations, scale)
     measured = rows.measurements
     residual = residual_of_motion(measured, motion[0])
     weighed = measured.weighed(residual)
@@ -220,65 +224,31 @@ def _detect(stack: GreyFrames, timing: SensorTiming, options: FreeMotionOptions,
     if not scale.same_for_all_columns:
         middle = torch.zeros(1, dtype=torch.float64, device="cpu")
         of_middle = ColumnMotion.of_columns(scale.free_motion(motion), middle, rowwise, len(starts), scale.height)
-    of_bands = bands_reasons(start, scale.width, of_middle[0], scale.axes)
+    of_bands = _bands_reasons(start, scale.width, of_middle[0], scale.axes)
     report = _report(free, spread, measured, timing, times, scale, of_bands, rows.differential()[0])
     return report.to(stack.images.device)
 
 
-def _measure_field(
-    stack: GreyFrames, timing: RowTiming, start: FreeMotion, scale: FieldScale, iterations: int
+def _measured_around(
+    motion: FreeMotion, stack: GreyFrames, timing: RowTiming, spacing: float, iterations: int, scale: FieldScale | None
 ) -> tuple[MeasuredRows, FreeMotion]:
-    """``measure_freely`` with roll and zoom, from a motion without them; all components in px."""
-    still = torch.zeros_like(start.coefficients[:, :1]).expand(-1, scale.axes - 2, -1)
-    drift = torch.cat([start.tones.image_motion, start.tones.image_motion.new_zeros(1, scale.axes - 2)], -1)
-    tones = Vibration(torch.zeros(1, scale.axes, 1), 0.0, 0.0, drift)
-    motion = FreeMotion(torch.cat([start.coefficients, still], 1), start.start, start.spacing, tones)
+    """The rows of one stack around a spline, and the spline (a batch of one), from rounds of measuring and fitting.
 
-    def strips_for(motion: FreeMotion) -> GroupedStrips:
-        motion = motion.to(stack.images.device)
-        return grouped_strips(stack.images, stack.valid, timing, motion, scale, pairs=False)
-
-    # strips follow the size of roll and zoom, which are unknown in the first round
-    return _rounds(strips_for, motion, start.spacing, record_of(stack, timing), iterations, grouped_in=(0, 1))
-
-
-def _rounds(
-    grouped: Callable[[FreeMotion], GroupedFrames],
-    motion: FreeMotion,
-    spacing: float,
-    record: tuple[float, float],
-    count: int,
-    *,
-    grouped_in: tuple[int, ...] = (0,),
-) -> tuple[MeasuredRows, FreeMotion]:
-    """Rounds of measuring the rows of one stack around a spline and fitting it to them.
-
-    The frames are ``grouped`` for the motion before some of the rounds.
+    ``scale`` is that of roll and zoom, with which rows are measured in strips of columns.
     """
-    for number in range(count):
-        if number in grouped_in:
-            rows = grouped(motion)
-        measured = rows.measure(motion.to(rows.groups[0].starts.device), keep_images=False)
+    images, device = stack.images, stack.images.device
+    for number in range(iterations):
+        if scale is None and number == 0:
+            rows: GroupedFrames = grouped_frames(images, stack.valid, timing, motion.to(device))
+        elif scale is not None and number < 2:  # strips follow the size of roll and zoom, unknown in the first round
+            rows = grouped_strips(images, stack.valid, timing, motion.to(device), scale, pairs=False)
+        measured = rows.measure(motion.to(device), keep_images=False)
         measurements = measured.measurements
         if number:
             measurements = measurements.reweighted(residual_of_motion(measurements, motion[0]))
         # while iterating, any drift is an image motion, which the scene rows of the groups follow
-        motion = _motion(_fit_spline(measurements, spacing, record))
+        motion = _motion(_fit_spline(measurements, spacing, record_of(stack, timing)))
     return replace(measured, measurements=measurements), motion
-
-
-def measure_freely(
-    stack: GreyFrames, timing: RowTiming, banded: Measurements, knot_rows: int, iterations: int
-) -> tuple[MeasuredRows, FreeMotion]:
-    """The rows of one stack around a spline, and the spline (a batch of one), from measurements of row bands."""
-    record = record_of(stack, timing)
-    spacing = max(knot_rows * timing.row_time, (record[1] - record[0]) / 3000)  # the cost grows with knots^3
-    motion = _motion(_fit_spline(banded, max(spacing, 0.5 * banded.average_times[0]), record))
-
-    def groups_for(motion: FreeMotion) -> GroupedFrames:
-        return grouped_frames(stack.images, stack.valid, timing, motion.to(stack.images.device))
-
-    return _rounds(groups_for, motion, spacing, record, iterations)
 
 
 def start_of_stack(stack: GreyFrames, timing: SensorTiming, bands: RegistrationOptions) -> tuple[RowTiming, BandStart]:
@@ -325,19 +295,12 @@ def _moved(measured: Measurements, motion: Motion) -> Array:
     return table(torch.stack(at_nodes, -1) @ shares)
 
 
-def band_errors(banded: Measurements, motion: Motion) -> list[float]:
-    """Mean difference in px of the offsets of the row bands of one stack from a motion in row order, for each axis."""
-    rest = _offsets_of_bands(banded, residual_of_motion(banded, motion))
-    best = np.sort(np.abs(rest), 0)[: math.ceil(0.75 * len(rest))]  # clouds may cover the others
-    return best.mean(0).tolist()
-
-
 def _offsets_of_bands(banded: Measurements, displacements: Array) -> Array:
     """(N, 2) px, offsets of the bands that were found from displacements (1, N, 2, 2)."""
     return np.diff(displacements[0], axis=1)[banded.weights[0].min(-1) > 0, 0]
 
 
-def bands_reasons(start: BandStart, columns: int, motion: Motion, axes: int = 2) -> list[list[Reason]]:
+def _bands_reasons(start: BandStart, columns: int, motion: Motion, axes: int = 2) -> list[list[Reason]]:
     """Reasons against a motion of each axis in row order that the row bands of one stack of ``columns`` px contradict.
 
     Noise without a scene has offsets of any size, and rows that are measured around a fit to them confirm it.
@@ -345,17 +308,13 @@ def bands_reasons(start: BandStart, columns: int, motion: Motion, axes: int = 2)
     banded = start.measurements
     values = _offsets_of_bands(banded, banded.displacements)
     size = np.abs(values - values.mean(0)).mean(0).tolist()
-    allowed = [max(MAX_BAND_ERROR, 0.3 * axis) for axis in size]  # px
-    compared = zip(AXIS_NAMES, band_errors(banded, motion), allowed, strict=False)
+    allowed = [max(_MAX_BAND_ERROR, 0.3 * axis) for axis in size]  # px
+    rest = _offsets_of_bands(banded, residual_of_motion(banded, motion))
+    best = np.sort(np.abs(rest), 0)[: math.ceil(0.75 * len(rest))]  # clouds may cover the others
+    compared = zip(AXIS_NAMES, best.mean(0).tolist(), allowed, strict=False)
     against = [[Reason("bands_contradict", *of_axis)] if of_axis[1] > of_axis[2] else [] for of_axis in compared]
     of_all = scene_reasons(start.curve, columns)[0]
     return [of_all + of_axis for of_axis in [*against, [], []][:axes]]
-
-
-def unexplained_reasons(axis: str, residual: float, moved: float, model: str) -> list[Reason]:
-    """Reasons against a fit whose rms ``residual`` in px exceeds 15 % of the rms motion ``moved``, and 0.03 px."""
-    allowed = max(0.15 * moved, 0.03)  # px
-    return [Reason("motion_unexplained", axis, residual, allowed, {"model": model})] if residual > allowed else []
 
 
 def _motion(fit: "_SplineFit", largest_drift: tuple[float, float] = (0.0, 0.0)) -> FreeMotion:
@@ -436,21 +395,20 @@ def _normal_band(index: Array, weights: Array, seen: Array, row_weights: Array, 
     The value of a row in a frame depends on the coefficients ``index`` (R, G, M) by the factors ``weights``. ``seen``
     (R, G) is 1 where a frame contains the row, else 0; ``row_weights`` (R,) are those of the rows.
     """
-    inside = seen[..., None] > 0
-    first = np.minimum(np.where(inside, index, count - 1).min((1, 2)), count - 1)
-    index = np.where(inside, index, first[:, None, None])
-    band = np.zeros((int(np.ptp(index, (1, 2)).max()) + 1, count))
-    for part in runs(len(seen), 32):  # rows at a time, with the coefficients that they depend on
-        used, place = np.unique(index[part], return_inverse=True)
-        visible = seen[part, :, None]
-        flat = len(used) * np.arange(visible.size)[:, None] + place.reshape(visible.size, -1)
-        design = np.bincount(flat.ravel(), weights[part].ravel(), len(used) * visible.size)
-        design = design.reshape(*visible.shape[:2], -1) * visible
-        design -= visible * (design.sum(1, keepdims=True) / np.maximum(visible.sum(1, keepdims=True), 1.0))
-        apart = used[:, None] - used
-        within = (apart >= 0) & (apart < len(band))
-        gram = (design * row_weights[part, None, None]).reshape(visible.size, -1).T @ design.reshape(visible.size, -1)
-        band[apart[within], np.broadcast_to(used, apart.shape)[within]] += gram[within]
+    number, frames = seen.shape
+    value = np.arange(seen.size)
+    # 1. Values of the rows in all frames as functions of the coefficients, less their mean over the frames.
+    places = (value.repeat(index.shape[-1]), index.ravel())
+    values = sparse.csr_array(((weights * seen[..., None]).ravel(), places), shape=(seen.size, count))
+    values.eliminate_zeros()
+    of_rows = sparse.csr_array((seen.ravel(), (value, value // frames)), shape=(seen.size, number))
+    mean = sparse.diags_array(1 / np.maximum(seen.sum(1), 1.0)) @ (of_rows.T @ values)
+    relative = values - of_rows @ mean
+    # 2. The weighted products of the columns.
+    normal = (relative.T @ sparse.diags_array(row_weights.repeat(frames)) @ relative).tocoo()
+    below = normal.row >= normal.col
+    band = np.zeros((int((normal.row - normal.col).max(initial=0)) + 1, count))
+    band[(normal.row - normal.col)[below], normal.col[below]] = normal.data[below]
     return band
 
 
@@ -690,7 +648,10 @@ def _report(
     moved = (value - value.mean(0)).square().mean((0, 1)).sqrt()
     findings = []
     for axis, name in enumerate(AXIS_NAMES[: scale.axes]):
-        against = unexplained_reasons(name, float(rest[axis]), float(moved[axis]), "smooth motion") + of_bands[axis]
+        against, residual_of_axis = list(of_bands[axis]), float(rest[axis])
+        allowed = max(0.15 * float(moved[axis]), 0.03)  # px
+        if residual_of_axis > allowed:
+            against.insert(0, Reason("motion_unexplained", name, residual_of_axis, allowed))
         size = math.sqrt(2) * float(moved[axis] if scale.axes == 2 else moved[:2].amax())
         against += rotation_reasons(axis, scale.axes, apart.tolist(), size)
         if float(std_seen[axis]) > _MAX_STD_SEEN:
