@@ -280,7 +280,6 @@ def test_pixels_beyond_all_scales(value):
         (lambda: flicker(torch.ones(1, 64, 64)), "100% of the pixels are saturated"),
         (lambda: flicker(torch.full((2, 128, 64), 0.5)), "no flicker found"),
         (lambda: flicker(torch.rand(1, 16, 64)), "16 rows along the scan"),
-        (lambda: flicker(FRAMES[:1], on_fraction=0.5, light_contrast=0.5), "not both"),
         (lambda: flicker(FRAMES[:1], 30.0, frame_rate=29.97), "slower than a frame"),
         (lambda: flicker(torch.full((1, 64, 64), 900, dtype=torch.int16)), "full_scale"),
         (lambda: Margins(4, 4, 0, 0).cut(torch.zeros(8, 8)), "leave nothing of frames of 8 x 8 px"),
