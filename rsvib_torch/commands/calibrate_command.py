@@ -92,7 +92,7 @@ def calibrate(given: CalibrateOptions) -> Answer:
         raise ValueError(f"the row time is not certain: {'; '.join(result.reasons)}")
     period: Table = {"frame_rate": None} if result.frame_rows is None else {"frame_rows": result.frame_rows}
     values: Table = {"row_time": result.row_time, "row_time_std": result.row_time_std}
-    values |= {"exposure_time": given.exposure or result.exposure_time} | period
+    values |= {"exposure_time": given.exposure} | period
     values |= {"scan_axis": given.scan_axis, "readout_direction": result.readout_direction}
     table = sensor_toml(values, ["Written by rsvib calibrate.", *result.notes])  # unknown values are comments
     rows = stack.shape[of_both["scan_axis"]]

@@ -25,7 +25,7 @@ ScanAxis = Literal[-2, -1, "y", "x"]
 class RowTimeCalibration(
     JudgedResult,
     units={
-        **dict.fromkeys(("row_time", "row_time_std", "exposure_time", "exposure_time_std", "candidates"), "s"),
+        **dict.fromkeys(("row_time", "row_time_std", "candidates"), "s"),
         **{"period_rows": "rows", "flicker_frequency": "Hz", "frame_rows": "row times"},
     },
 ):
@@ -39,8 +39,6 @@ class RowTimeCalibration(
         flicker_frequency: In Hz, as given or found; None without flickering light.
         frame_rows: Row times from one frame to the next, where the frame rate is known.
         readout_direction: ``"forward"`` or ``"reverse"``, from bands that move between frames.
-        exposure_time: T_e in seconds.
-        exposure_time_std: Its standard deviation.
         notes: Reasons for undetermined values, and warnings.
         candidates: Row times in seconds that explain the motion of the frames, negative for a reverse readout; empty
             for a calibration with flickering light.
@@ -58,8 +56,6 @@ class RowTimeCalibration(
     flicker_frequency: float | None = None
     frame_rows: float | None = None
     readout_direction: Literal["forward", "reverse"] | None = None
-    exposure_time: float | None = None
-    exposure_time_std: float | None = None
     notes: tuple[str, ...] = ()
     candidates: tuple[float, ...] = ()
     reliable: bool = True
@@ -82,10 +78,6 @@ class RowTimeCalibration(
                 f"flicker {self.flicker_frequency:.6g} Hz",
                 f"bands of {self.period_rows:.3f} rows, contrast {self.contrast:.3g}",
             ]
-        if self.exposure_time is not None:
-            std = None if self.exposure_time_std is None else 1e6 * self.exposure_time_std
-            rows = "" if self.row_time is None else f", {self.exposure_time / self.row_time:.2f} row times"
-            lines.append(f"exposure {measured_text(1e6 * self.exposure_time, std or None)} us{rows}")
         if self.frame_rows is not None:
             lines.append(f"frame period {self.frame_rows:.2f} row times")
         if self.readout_direction is not None:
