@@ -1,4 +1,4 @@
-"""A motion that another instrument recorded: alignment with the clock of the frames, and comparison with them.
+"""A motion that another instrument recorded: alignment with the clock of the frames.
 
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.checks.arrays import FramesOrFiles
-from rsvib_torch.checks.values import check_single, described
+from rsvib_torch.checks.values import check_single
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.grouped_frames import grouped_frames
 from rsvib_torch.detection.shapes.free import record_of, residual_of_motion, rms_motion, start_of_stack
@@ -31,16 +31,12 @@ from rsvib_torch.frames.orientation import (
 from rsvib_torch.gyroscope.corner_tracks import corner_tracks
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
 from rsvib_torch.gyroscope.rotation_alignment import AlignOptions, RotationAlignment, align_rates, offset_range, outside
-from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array, scaled_inverse, table, tensor
-from rsvib_torch.options import OffsetOptions
-from rsvib_torch.results.presentation import AXIS_NAMES, JudgedResult
+from rsvib_torch.results.presentation import JudgedResult
 from rsvib_torch.results.reason import Reason
-from rsvib_torch.text import measured_text, text_table, wrapped
-
-_MIN_CHANGE = 0.05  # px, registration errors of bands
+from rsvib_torch.text import measured_text, wrapped
 
 P = ParamSpec("P")
 
@@ -301,124 +297,3 @@ def fit_clock(
         if (np.abs(change) <= 1e-3 * np.sqrt(np.maximum(covariance.diagonal(), 0.0))).all():
             break
     return clock, covariance
-
-
-# Comparison
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class MotionCheck(
-    JudgedResult,
-    units={"before": "px", "after": "px", "times": "s", "offsets": "px", "residual": "px"},
-    shapes={"before": "2", "after": "2", "times": "N", "offsets": "N 2", "residual": "N 2"},
-):
-    """Offsets of rows between frames, before and after a given motion is subtracted.
-
-    Attributes:
-        before: (2,) px, rms offset of row bands between consecutive frames, axes (x, y), of the nine tenths that fit
-            best: the others may be clouds or registration errors.
-        after: (2,) px, the same of the offsets less those of the motion.
-        helps: Whether the motion reduces the offsets, both axes together.
-        findings: Each ``Reason`` against the motion; ``reasons`` has their texts.
-        times: (N,) s, exposure starts of the registered row bands in the earlier frame of their pair.
-        offsets: (N, 2) px, offsets of these bands, axes (x, y).
-        residual: (N, 2) px, these offsets less those of the motion.
-    """
-
-    before: Tensor
-    after: Tensor
-    helps: bool
-    findings: tuple[Reason, ...]
-    times: Tensor
-    offsets: Tensor
-    residual: Tensor
-
-    def summary(self) -> str:
-        """Offsets before and after the motion is subtracted, and the verdict."""
-        rows = [
-            [name, measured_text(before, digits=3), measured_text(after, digits=3)]
-            for name, before, after in zip("xy", self.before, self.after, strict=True)
-        ]
-        table = text_table(("axis", "offset between frames (px rms)", "without the motion (px rms)"), rows)
-        return "\n".join([table, "the motion reduces the offsets" if self.helps else "not reduced", *self.reasons])
-
-
-class _ChecksMotion(Protocol[P]):
-    """Type of ``check_motion``."""
-
-    def __call__(
-        self, frames: FramesOrFiles, timing: SensorTiming, motion: Motion, *args: P.args, **kwargs: P.kwargs
-    ) -> MotionCheck:
-        """Call the function."""
-
-
-def _check_options(options: Callable[P, OffsetOptions]) -> Callable[[Callable[..., MotionCheck]], _ChecksMotion[P]]:
-    return lambda function: entry_point(options, function)
-
-
-@_check_options(OffsetOptions)
-@full_precision
-@without_gradients
-def check_motion(frames: FramesOrFiles, timing: SensorTiming, motion: Motion, options: OffsetOptions) -> MotionCheck:
-    """Compare a given motion with the offsets of row bands between frames.
-
-    A motion with the wrong sign, clock or focal length makes frames worse: its subtraction increases the offsets.
-
-    Args:
-        frames: Stack (T, H, W) or (T, C, H, W) of at least two frames; tensor, array, list of these, or files; NaN
-            marks missing pixels.
-        timing: The sensor.
-        motion: A vibration or free motion in image axes, on the clock of the frames.
-        options: Options, as in ``detect_vibration``.
-
-    Returns:
-        Rms offsets with and without the motion, and a verdict.
-
-    Raises:
-        ValueError: If frames or motion are a batch, or the frames cannot be registered.
-
-    Example:
-        >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.datasets import example_frames
-        >>> frames, timing, vibration = example_frames()
-        >>> print(rsv.check_motion(frames, timing, vibration))
-        axis  offset between frames (px rms)  without the motion (px rms)
-        x     2.36                            0.0661
-        y     0.576                           0.0953
-        the motion reduces the offsets
-    """
-    if not isinstance(motion, Motion):
-        raise TypeError(f"motion must be a Motion, got {described(motion)}")
-    stack = grey_frames(frames, timing, options)
-    timing = stack.timing
-    check_single("motion", motion.batch_shape)
-    if stack.batched:
-        raise ValueError("check_motion takes one stack, not a batch")
-    measured = start_of_stack(stack, timing, options)[1].measurements
-    turned = motion.to("cpu").to_row_order(timing)
-    used = tensor(measured.weights[0].min(-1) > 0)
-
-    unexplained = residual_of_motion(measured, turned)
-    offsets, residual = (
-        offsets_from_row_order(tensor(np.diff(values[0], axis=1)[:, 0])[used], timing)
-        for values in (measured.displacements, unexplained)
-    )
-    before, after = _rms(offsets), _rms(residual)
-    findings = []
-    for name, moved, rest in zip(AXIS_NAMES, before.tolist(), after.tolist(), strict=False):
-        largest, expected = moved + _MIN_CHANGE, max(0.5 * moved, _MIN_CHANGE)
-        if rest > largest:
-            findings.append(Reason("motion_enlarges_offsets", name, rest, largest, {"moved": moved}))
-        elif rest > expected and moved > 2 * _MIN_CHANGE:
-            findings.append(Reason("motion_leaves_offsets", name, rest, expected, {"moved": moved}))
-    rest, moved = float(after.norm()), float(before.norm())
-    if rest >= moved and not findings:
-        findings.append(Reason("offsets_not_reduced", None, rest, moved))
-    times = tensor(measured.exposure_starts[0, :, 0])[used]
-    return MotionCheck(before, after, rest < moved, tuple(findings), times, offsets, residual)
-
-
-def _rms(offsets: Tensor) -> Tensor:
-    """(2,) rms of the smallest nine tenths of offsets (N, 2)."""
-    square = offsets.square().sort(dim=0).values
-    return square[: max(1, math.ceil(0.9 * len(square)))].mean(0).sqrt()

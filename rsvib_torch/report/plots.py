@@ -591,13 +591,6 @@ def _spectrum_figure(result: detection.DisplacementSpectrum) -> Figure:
     return figure
 
 
-def _check_figure(result: gyroscope.MotionCheck) -> Figure:
-    """Draw the offsets of row bands of each axis, before and after a motion is subtracted."""
-    before = [f"offsets {measured_text(rms, digits=3)} px rms" for rms in result.before]
-    after = [f"without the motion {measured_text(rms, digits=3)} px rms" for rms in result.after]
-    return _offsets_figure(result.times, ((before, result.offsets, _GREY), (after, result.residual, None)))
-
-
 def _rotation_figure(result: gyroscope.RotationAlignment) -> Figure:
     """Draw X, Y and roll from frame to frame, measured in the images and by the gyroscope, and their differences."""
     figure, panels = _panels(8, 7.2, 3, sharex=True)
@@ -629,7 +622,6 @@ FIGURES.update(
         (RowTimeCalibration, 0): _calibration_figure,
         (gyroscope.ClockAlignment, 0): lambda result: motion_figure(result.motion),
         (gyroscope.RotationAlignment, 0): _rotation_figure,
-        (gyroscope.MotionCheck, 0): _check_figure,
         (Vibration, 0): motion_figure,
         (FreeMotion, 0): motion_figure,
         (MtfCurve, 0): lambda curve: mtf_figure(

@@ -49,7 +49,7 @@ class RowTimeOptions(OffsetOptions):
     """Shortest and longest possible row time in s. By default the rows of a frame are read within a tenth to the whole
     of the frame period."""
     exposure_time: Positive | None = None
-    """Exposure in s, if known. It does not affect the row time, but blur by long exposures may be refused without it."""
+    """Exposure in s, if known. It does not affect the row time, but long ones may be refused without it."""
     scan_axis: Literal[-2, -1, "y", "x"] = -2
     """Axis along which rows follow each other, as in ``SensorTiming``."""
     readout_direction: Literal["forward", "reverse"] | None = None

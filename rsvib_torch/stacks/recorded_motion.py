@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.gyroscope.alignment import ClockAlignment, FittedClock, MotionCheck, align_motion, check_motion
+from rsvib_torch.gyroscope.alignment import ClockAlignment, FittedClock, align_motion
 from rsvib_torch.gyroscope.corner_tracks import corner_tracks
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
 from rsvib_torch.gyroscope.rotation_alignment import AlignOptions, RotationAlignment, align_rates, offset_range, outside
@@ -93,16 +93,6 @@ def align_stack(
     if len(runs) == 1:
         return align(*part_of_stack(source, info, timing, runs[0]), recorded, offsets=offsets)
     return _aligned_runs(source, info, timing, recorded, runs, offsets, align)
-
-
-def check_stack_motion(
-    source: Path, info: StackInfo, timing: SensorTiming, motion: FreeMotion, ignore: Tensor | None = None
-) -> MotionCheck:
-    """``check_motion`` for a stack of any length, by the frames in its middle."""
-    timing = timing_from_first_frame(timing, info)
-    runs = compared_runs(info.shape[0])
-    frames, of_run = part_of_stack(source, info, timing, runs[len(runs) // 2])
-    return check_motion(frames, of_run, motion, ignore=ignore)
 
 
 def _grey_frames(

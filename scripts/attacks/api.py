@@ -109,7 +109,6 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     augmentation = rsv.RollingShutterVibration(timing, **random_tones)
     detector = rsv.VibrationDetector(timing, **DETECTION)
     restorer = rsv.VibrationRestorer(timing, method="dewarp", check=False)
-    check = rsv.check_motion(frames, timing, recorded, **BANDS)
     alignment = rsv.align_motion(frames, timing, recorded, offsets=(-0.001, 0.001), **BANDS)
     verdict = rsv.judge_restoration(frames, restored, timing, vibration)
     optics, sensor_noise = rsv.Optics(0.5, 0.4, 1.0), rsv.SensorNoise(5000.0, 0.01, 12, 0.01, 0.01, 0.01, 3)
@@ -220,7 +219,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     described += (detected.spectrum(), rsv.CameraMode("A", "B", "", 1920, 1080, 30.0, 0.01, 1e-4, 3, "forward", 1080))
     of_frame = {one.name: getattr(detected, one.name) for one in fields(rsv.FollowedVibration) if one.name != "times"}
     described += (rsv.FollowedVibration(**of_frame, times=times[0]),)
-    described += (detected, detected.offsets, free, swept, check, alignment, rates, rotation)
+    described += (detected, detected.offsets, free, swept, alignment, rates, rotation)
     for value in described:
         result[type(value).__name__] = _with_fields(value)
     for value in (vibration, recorded, timing, *described):

@@ -20,7 +20,6 @@ from rsvib_torch.video import Margins
 TIMING = rsv.SensorTiming(1e-4, 6, 104)
 LONG = rsv.SensorTiming(1e-4, 6, 104, frame_start_times=[0.0, 2.0])
 BANDS = {"band_rows": 16, "band_step": 8, "search": 6}
-CURVES = (torch.zeros(1), torch.zeros(1, 2), torch.zeros(1, 2))  # times, offsets, residual of a MotionCheck
 FRAMES = torch.rand(2, 96, 64, generator=torch.Generator().manual_seed(0))
 RGB = FRAMES[:, None].repeat(1, 3, 1, 1)
 WIDE = torch.rand(2, 96, 128, generator=torch.Generator().manual_seed(0))
@@ -170,7 +169,6 @@ def test_pixels_beyond_all_scales(value):
         (lambda: blur()(FRAMES[0].to(torch.uint16)), "scene must be a floating-point tensor, got torch.uint16"),
         (lambda: rsv.row_psf(VIBRATION, STARTS, TIMING, quadrature="simpson"), "quadrature must be 'midpoint'"),
         (lambda: rsv.row_psf(ROLL, TIMING.row_starts(1, 8), TIMING), "not defined with roll, zoom or a camera"),
-        (lambda: rsv.MotionCheck(torch.zeros(3), torch.zeros(2), True, (), *CURVES), r"before must have shape \(2,\)"),
         (lambda: rsv.detect_motion(FRAMES, TIMING, knot_rows=10**9, **BANDS), "knot_rows must be at most"),
         (
             lambda: rsv.FreeMotion.from_samples(torch.arange(11.0), torch.zeros(11, 2, requires_grad=True)),

@@ -69,7 +69,6 @@ def make_results(frames, detection, windows):
         free.motion,
         rsv.detect_swept_tone(frames, TIMING),
         rsv.judge_restoration(frames, restored, TIMING, detection),
-        rsv.check_motion(frames, TIMING, detection.vibration),
         rsv.align_motion(frames, TIMING, recording(), fit_scale=False),
         rates(),
         rsv.align_motion(frames, TIMING, rates(), camera=rsv.Camera(900.0), offsets=(0.299, 0.301)),
