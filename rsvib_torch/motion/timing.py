@@ -175,33 +175,6 @@ class SensorTiming:
         section: SensorSection = validate(_SensorFile, stated, str(path)).sensor
         return section.to_timing()
 
-    @classmethod
-    def line_sensors(
-        cls, line_time: float, delays: Sequence[float], num_lines: int, exposure_lines: float = 1.0
-    ) -> SensorTiming:
-        """Timing of images of the same ground from several lines (or bands) of a push-broom sensor.
-
-        Each line records the same ground line by line after its own delay. Registered to the ground, the images are
-        frames of a rolling shutter whose exposures start after these delays: the jitter of the platform is estimated
-        from parallax pairs, except at frequencies that are multiples of one over all delays.
-
-        Args:
-            line_time: Time between lines, in seconds.
-            delays: Delay in s of the recording of the ground by each line, increasing; 0 for the first.
-            num_lines: Number of lines of the images.
-            exposure_lines: Exposure in line times, including the stages of time-delayed integration.
-
-        Example:
-            >>> pair = SensorTiming.line_sensors(line_time=1e-4, delays=[0.0, 0.04], num_lines=5000)
-            >>> pair.frame_starts(2).tolist()
-            [0.0, 0.04]
-        """
-        lines = check_whole_number("num_lines", num_lines, at_least=1)
-        check_number("exposure_lines", exposure_lines, above=0.0)
-        if not isinstance(delays, Sequence) or len(delays) < 2:
-            raise ValueError(f"delays must have at least two entries, got {described(delays)}")
-        return cls(line_time, exposure_lines, max(lines, exposure_lines), frame_start_times=tuple(delays))
-
     @property
     def exposure_time(self) -> float:
         """Exposure time T_e = N_e T_row in seconds."""
