@@ -129,9 +129,8 @@ def phone(folder: Path) -> None:
             frames[part],
             timing,
             rates,
-            camera=PHONE_CAMERA,
+            camera=PHONE_CAMERA if "known" in name else None,
             offsets=CLOCK_RANGE,
-            fit_gain="known" not in name,
             fit_row_time=True,
             ignore=ignore,
         )

@@ -26,7 +26,6 @@ from rsvib_torch.frames.orientation import (
     magnitudes_from_row_order,
     offsets_from_row_order,
     reasons_from_row_order,
-    sequence_from_row_order,
 )
 from rsvib_torch.gyroscope.corner_tracks import corner_tracks
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
@@ -50,12 +49,11 @@ class ClockAlignment(
     """Time of the frames within a recorded motion: ``scale t + offset`` on its clock.
 
     Attributes:
-        motion: The motion in image axes on the clock of the frames, with gain and drift.
+        motion: The motion in image axes on the clock of the frames, with drift.
         offset: Reading of the recording's clock at time 0 of the frames, in seconds.
         offset_std: Its standard deviation.
         scale: Seconds on the recording's clock per second of the frames.
         scale_std: Its standard deviation; 0 if it was not fitted.
-        gain: Factor of the recorded motion of each axis (x, y); 1 if it was not fitted.
         drift: (2,) px/s that the recording does not contain, as gyroscopes drift.
         unexplained: (2,) px, rms displacement of rows that the aligned motion does not explain, beyond their noise.
         reliable: Whether the recording explains the measurements, at this offset only.
@@ -67,26 +65,22 @@ class ClockAlignment(
     offset_std: float
     scale: float
     scale_std: float
-    gain: tuple[float, float]
     drift: Tensor
     unexplained: Tensor
     reliable: bool
     findings: tuple[Reason, ...]
 
     def summary(self) -> str:
-        """Offset and scale of the clock with standard deviations, gain, drift, and the verdict."""
+        """Offset and scale of the clock with standard deviations, drift, and the verdict."""
         verdict = "reliable" if self.reliable else f"not reliable: {'; '.join(self.reasons)}"
         drift, left = self.drift.tolist(), self.unexplained.tolist()
         second = measured_text(self.scale, self.scale_std or None, digits=8)
-        return "\n".join(
-            [
-                f"time 0 of the frames is {measured_text(self.offset, self.offset_std)} s of the recording",
-                f"1 s of the frames is {second} s of the recording",
-                f"x: recorded motion times {self.gain[0]:.4f}, drift {drift[0]:.3g} px/s, {left[0]:.2g} px unexplained",
-                f"y: recorded motion times {self.gain[1]:.4f}, drift {drift[1]:.3g} px/s, {left[1]:.2g} px unexplained",
-                wrapped(verdict),
-            ]
-        )
+        clock = [
+            f"time 0 of the frames is {measured_text(self.offset, self.offset_std)} s of the recording",
+            f"1 s of the frames is {second} s of the recording",
+        ]
+        axes = [f"{name}: drift {drift[k]:.3g} px/s, {left[k]:.2g} px unexplained" for k, name in enumerate("xy")]
+        return "\n".join([*clock, *axes, wrapped(verdict)])
 
 
 @dataclass(frozen=True)
@@ -95,7 +89,6 @@ class FittedClock:
 
     at: float
     scale: float
-    gain: tuple[float, float]
     drift: tuple[float, float]
     middle: float
 
@@ -106,7 +99,7 @@ class FittedClock:
 
     def motion(self, recorded: FreeMotion) -> FreeMotion:
         """The recorded motion on the clock of the frames."""
-        moved = recorded.retimed(self.offset, self.scale, self.gain)
+        moved = recorded.retimed(self.offset, self.scale)
         knots = moved.knots - self.middle
         drift = knots.new_tensor(self.drift)[:, None] * knots
         return FreeMotion(moved.coefficients + drift, moved.start, moved.spacing, moved.tones, moved.camera)
@@ -201,16 +194,16 @@ def align_motion(
     turned = recorded.to_row_order(timing).to("cpu")
     low, high = offset_range(turned.start, turned.end, first, last, options.offsets)
     offset, other = best_offset(measured, turned, low, high, rowwise)
-    clock = FittedClock(offset + 0.5 * (first + last), 1.0, (1.0, 1.0), (0.0, 0.0), 0.5 * (first + last))
-    clock, _ = fit_clock(measured, turned, clock, False, options.fit_gain)
+    clock = FittedClock(offset + 0.5 * (first + last), 1.0, (0.0, 0.0), 0.5 * (first + last))
+    clock, _ = fit_clock(measured, turned, clock, False)
     weighed = measured.reweighted(residual_of_motion(measured, clock.motion(turned)))
-    clock, covariance = fit_clock(weighed, turned, clock, options.fit_scale, options.fit_gain)
+    clock, covariance = fit_clock(weighed, turned, clock, options.fit_scale)
     rows = grouped_frames(grey, stack.valid, rowwise, clock.motion(turned).expanded(1).to(grey.device))
     for _ in range(3):
         moved = clock.motion(turned).expanded(1).to(grey.device)
         measured = rows.measure(moved, keep_images=False).measurements
         weighed = measured.reweighted(residual_of_motion(measured, clock.motion(turned)))
-        clock, covariance = fit_clock(weighed, turned, clock, options.fit_scale, options.fit_gain)
+        clock, covariance = fit_clock(weighed, turned, clock, options.fit_scale)
     aligned = clock.motion(turned)
     residual = residual_of_motion(measured, aligned)
     covariance = covariance / measured.independent_fraction(residual)
@@ -221,15 +214,13 @@ def align_motion(
     reasons = recording_reasons(rms_motion(measured, aligned).tolist(), rest.tolist(), other)
     reasons += outside(clock.offset, offset_std, options.offsets)
     drift = offsets_from_row_order(torch.tensor(clock.drift, dtype=torch.float64, device="cpu"), timing)
-    gain_x, gain_y = sequence_from_row_order(clock.gain, timing)
-    in_image = replace(clock, gain=(gain_x, gain_y), drift=(float(drift[0]), float(drift[1])))
+    in_image = replace(clock, drift=(float(drift[0]), float(drift[1])))
     return ClockAlignment(
         motion=in_image.motion(recorded),
         offset=clock.offset,
         offset_std=offset_std,
         scale=clock.scale,
         scale_std=float(std[1]),
-        gain=in_image.gain,
         drift=drift,
         unexplained=magnitudes_from_row_order(tensor(rest), timing).to(grey.device),
         reliable=not reasons,
@@ -266,21 +257,20 @@ def best_offset(
 
 
 def fit_clock(
-    measured: Measurements, recorded: FreeMotion, clock: FittedClock, fit_scale: bool, fit_gain: bool
+    measured: Measurements, recorded: FreeMotion, clock: FittedClock, fit_scale: bool
 ) -> tuple[FittedClock, Array]:
-    """Gauss-Newton on clock reading, scale, gain and drift, from start values; also their covariance (6, 6)."""
+    """Gauss-Newton on clock reading, scale and drift, from start values; also their covariance (4, 4)."""
     starts = measured.exposure_starts
-    free = np.array([True, fit_scale, fit_gain, fit_gain, True, True])
+    free = np.array([True, fit_scale, True, True])
     for _ in range(12):
-        # 1. Displacement and velocity of the recording at the measured rows.
+        # 1. Velocity of the recording at the measured rows.
         middle = starts + 0.5 * measured.exposure_time - clock.middle
         in_time = recorded.retimed(clock.offset, clock.scale)
-        speed = table(in_time.velocity(tensor(starts + 0.5 * measured.exposure_time))) * clock.gain / clock.scale
-        value = table(in_time.mean_displacement(tensor(starts), measured.exposure_time))
-        # 2. Derivatives (1, N, G, 2, 6) of the displacements by the parameters.
+        speed = table(in_time.velocity(tensor(starts + 0.5 * measured.exposure_time))) / clock.scale
+        # 2. Derivatives (1, N, G, 2, 4) of the displacements by the parameters.
         x, y = np.eye(2)
         middle = middle[..., None]
-        columns = [speed, speed * middle, value * x, value * y, middle * x, middle * y]
+        columns = [speed, speed * middle, middle * x, middle * y]
         jacobian = measured.relative(np.stack(columns, -1)) * free
         # 3. The normal equations and the step.
         residual = residual_of_motion(measured, clock.motion(recorded))
@@ -291,9 +281,8 @@ def fit_clock(
         change = inverse @ right
         known = max(float(measured.num_measurements.sum()), 8.0) - free.sum()
         covariance = inverse * (measured.square(residual).sum() / known)
-        at, speed_of_clock, *others = (np.array([clock.at, clock.scale, *clock.gain, *clock.drift]) + change).tolist()
-        gain, drift = (others[0], others[1]), (others[2], others[3])
-        clock = FittedClock(at, max(speed_of_clock, 0.1 * clock.scale), gain, drift, clock.middle)
+        at, speed_of_clock, *drift = (np.array([clock.at, clock.scale, *clock.drift]) + change).tolist()
+        clock = FittedClock(at, max(speed_of_clock, 0.1 * clock.scale), (drift[0], drift[1]), clock.middle)
         if (np.abs(change) <= 1e-3 * np.sqrt(np.maximum(covariance.diagonal(), 0.0))).all():
             break
     return clock, covariance

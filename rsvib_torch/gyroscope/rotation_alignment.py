@@ -181,11 +181,6 @@ class AlignOptions(OffsetOptions):
         "A result outside them is refused.",
     )
     fit_scale: bool = Field(default=True, description="Whether to fit the ratio of the speeds of the clocks.")
-    fit_gain: bool = Field(
-        default=False,
-        description="Whether to fit a factor of the recorded motion of each axis; with angular rates, the focal length "
-        "of the camera.",
-    )
     fit_row_time: bool = Field(
         default=False,
         description="Whether to fit the row time as well, with angular rates; ``timing`` has the start value.",
@@ -204,16 +199,14 @@ def align_rates(
     last += rows * timing.row_time + timing.exposure_time
     limits = offset_range(rates.start, rates.end, begin, last, offsets)
     middle = 0.5 * (begin + last)
-    fit_focal_length = camera is None or options.fit_gain
-    known = None if fit_focal_length else camera
-    free = (True, True, True, True, options.fit_scale, fit_focal_length, options.fit_row_time)
+    free = (True, True, True, True, options.fit_scale, camera is None, options.fit_row_time)
 
     def parameters(start: Start, row_time: float) -> Tensor:
         values = [0.0, 0.0, 0.0, start.offset + middle, 1.0, start.focal_length, row_time]
         return torch.tensor(values, dtype=torch.float64)
 
     # 1. Axes and offsets that explain the displacements best, and the fit from there with the smallest residuals.
-    search = search_orientations(tracks, tracks.roughly(), rates, timing.row_time, limits, known)
+    search = search_orientations(tracks, tracks.roughly(), rates, timing.row_time, limits, camera)
     lens = camera or Camera(search.starts[0].focal_length)
     first = search.starts[0]
     near = [first, *(start for start in search.starts[1:3] if start.cost < _NEAR_COST * first.cost)]

@@ -89,7 +89,7 @@ def align_stack(
         tracks = corner_tracks(_grey_frames(source, info, pairs, ignore), starts, timing)
         return align_rates(tracks, timing, recorded, options)
     runs = compared_runs(info.shape[0])
-    align = partial(align_motion, fit_gain=options.fit_gain, ignore=options.ignore)
+    align = partial(align_motion, ignore=options.ignore)
     if len(runs) == 1:
         return align(*part_of_stack(source, info, timing, runs[0]), recorded, offsets=offsets)
     return _aligned_runs(source, info, timing, recorded, runs, offsets, align)
@@ -144,9 +144,8 @@ def _aligned_runs(
     covariance *= max(1.0, rest)
     scale, gradient = 1.0 + float(line[0]), np.array([-middle, 1.0])
     offset, offset_std = float(gradient @ line), math.sqrt(gradient @ covariance @ gradient)
-    # 3. The motion with the gain and drift in the middle of the stack.
-    gain, drift = found[0].gain, found[0].drift
-    clock = FittedClock(offset + scale * middle, scale, gain, tuple(drift.tolist()), middle)
+    # 3. The motion with the drift in the middle of the stack.
+    clock = FittedClock(offset + scale * middle, scale, tuple(found[0].drift.tolist()), middle)
     findings = tuple(outside(offset, offset_std, offsets))
     return replace(
         found[0],

@@ -154,7 +154,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     new = {name: folder / name for name in ("new.npy", "new.mkv", "figure.png", "rates.gcsv", "maps")}
     with_camera = vibration.with_camera(rsv.Camera(900.0))
     different: dict[str, dict[str, Any]] = {  # values that differ from the pool, by function
-        "align_motion": {"camera": None, "fit_gain": True},
+        "align_motion": {"camera": None},
         "calibrate_row_time": {"frames": stripes},
         "calibrate_row_time_by_motion": {"row_time": (5e-5, 2e-4)},
         "comparison_figure": {"size": 32, "restored": restored[0]},

@@ -77,13 +77,6 @@ def test_clock_offset_and_drift_are_estimated_and_frames_restored(scene, frames,
     assert decibel(frames.numpy(), crop(scene)) < best - 12
 
 
-def test_wrong_focal_length_is_corrected(frames, gyroscope):
-    recorded = rsv.read_motion(gyroscope, unit="rad/s", focal_length=1.1 * FOCAL_LENGTH)
-    found = rsv.align_motion(frames, TIMING, recorded, fit_gain=True)
-    assert found.gain == pytest.approx((1 / 1.1, 1 / 1.1), rel=3e-3)
-    assert found.offset == pytest.approx(CLOCK, abs=5e-5)
-
-
 def test_unrelated_recording_is_not_reliable(frames, tmp_path):
     clock = np.arange(0.0, 1.0, 1e-3)
     path = log(tmp_path / "other.csv", clock, 3 * np.stack([np.sin(170 * clock), np.cos(230 * clock**1.3)], -1))
