@@ -132,7 +132,7 @@ def subpixel_peak(surface: Tensor) -> tuple[Tensor, Tensor]:
 
     The correlation of band-limited images is band limited, so that its samples at whole pixels determine it. For images
     smoothed by a Gaussian of 1 px, the polynomial through 9 samples per axis errs by less than 0.001 px, a three-point
-    parabola by 0.05 px. A and B are odd, the integer peak is at the centre; an axis of length 1 is not searched. The
+    parabola by 0.05 px. A and B are odd, the integer peak is at the centre. The
     result is the position (M, 2) as (row, column) relative to the centre, NaN where no maximum lies within one pixel of
     it, and the value there (M,); float64.
     """
@@ -147,10 +147,6 @@ def subpixel_peak(surface: Tensor) -> tuple[Tensor, Tensor]:
         )
         derivatives = (across @ samples @ along.mT).reshape(count, 9).T
         value, right, by_columns, down, mixed, _, by_rows = derivatives[:7]
-        if rows == 1:
-            by_rows = -np.ones(count)
-        if columns == 1:
-            by_columns = -np.ones(count)
         # 2. A step to the maximum, where there is one.
         determinant = by_rows * by_columns - np.square(mixed)
         converging = converging & (determinant > 0) & (by_rows < 0)

@@ -13,19 +13,17 @@ from rsvib_torch.registration.bands import (
     BINNING,
     LAGS,
     BandTask,
-    cut_lags,
     fine_offsets,
-    integer_peak,
-    subpixel_peak,
     take_windows,
     whole_pixel_peak,
 )
 
-# Zero-mean normalised cross-correlation (NCC)
 
+def _whole_pixels(task: BandTask) -> tuple[Tensor, Tensor]:
+    """Whole-pixel shifts (L, N, 2) of bands by cross-correlation of binned columns, and whether they are known (L, N).
 
-def register_ncc(task: BandTask) -> tuple[Tensor, Tensor]:
-    """Offsets and quality of bands: a search for whole pixels in binned columns, then the peak at full resolution."""
+    All methods begin with it: the profiles of a band are too short for the search range across the rows.
+    """
     factor = next((factor for factor in (BINNING, BINNING // 2) if task.width // factor >= 64), 1)
     reach, width, height = -(-task.search // factor), task.width // factor, task.first.shape[-2]
 
@@ -36,13 +34,21 @@ def register_ncc(task: BandTask) -> tuple[Tensor, Tensor]:
     first = binned(task.first, task.left[:, None], width)
     left = (task.left + task.coarse[:, 0])[:, None] - reach * factor
     second = binned(task.second, left, width + 2 * reach)
-    places, rows = task.places, task.places[..., 1]
+    rows = task.places[..., 1]
     of_first = torch.stack([torch.zeros_like(rows), rows], -1)
     of_second = torch.stack([torch.full_like(rows, reach), rows + task.coarse[:, None, 1]], -1)
     surface = _correlate_bands(first, second, of_first, of_second, (task.height, width), (task.search, reach))
     lag, inside = whole_pixel_peak(surface, factor)
-    shift = task.start + lag
-    moved = places + shift
+    return task.start + lag, inside
+
+
+# Zero-mean normalised cross-correlation (NCC)
+
+
+def register_ncc(task: BandTask) -> tuple[Tensor, Tensor]:
+    """Offsets and quality of bands by the peak of their cross-correlation."""
+    shift, inside = _whole_pixels(task)
+    places, moved = task.places, task.places + shift
     surface = _correlate_bands(task.first, task.second, places, moved, (task.height, task.width), (LAGS, LAGS))
     inside &= (moved[..., 1] >= LAGS) & (moved[..., 1] + task.height + LAGS <= task.first.shape[-2])
     return fine_offsets(task, shift, surface, inside)
@@ -132,26 +138,15 @@ def register_phase(task: BandTask) -> tuple[Tensor, Tensor]:
     The cross-power spectrum is whitened where it exceeds the noise, and low-passed, so that samples at whole pixels
     determine its peak.
     """
-    places = task.places
-    num_rows = task.first.shape[-2]
-    # search for whole pixels: these windows contain the band's content at every lag of the search range
-    tall, factor = task.height + 2 * task.search, BINNING
-    width = task.width // factor * factor
-    up = torch.tensor([0, task.search], device=places.device)
-    pair = [
-        take_windows(image, place[..., 1], place[..., 0], tall, width).unflatten(-1, (-1, factor)).mean(-1)
-        for image, place in ((task.first, places - up), (task.second, places + task.start - up))
-    ]
-    still = torch.zeros_like(task.start, dtype=task.first.dtype)
-    surface = _phase_surface(pair[0], pair[1], still, (task.search, -(-task.search // factor) + 1), (1.0, 1.0 * factor))
-    lag, valid = whole_pixel_peak(surface, factor)
-    shift, fraction = task.start + lag, still
+    places, num_rows = task.places, task.first.shape[-2]
+    shift, valid = _whole_pixels(task)
+    fraction = torch.zeros_like(shift, dtype=task.first.dtype)
     template = take_windows(task.first, places[..., 1], places[..., 0], task.height, task.width)
     for _ in range(2):  # the window follows the content: to a whole pixel, then to a fraction
         moved = places + shift
         inside = (moved[..., 1] >= 0) & (moved[..., 1] + task.height <= num_rows)
         window = take_windows(task.second, moved[..., 1], moved[..., 0], task.height, task.width)
-        surface = _phase_surface(template, window, fraction, (LAGS, LAGS), (1.0, 1.0))
+        surface = _phase_surface(template, window, fraction)
         offsets, quality = fine_offsets(task, shift, surface, valid & inside)
         best = torch.where(torch.isfinite(offsets), offsets, shift.to(offsets.dtype))
         shift = best.round().long()
@@ -165,12 +160,10 @@ def _hann(size: int, shift: Tensor) -> Tensor:
     return torch.sin(torch.pi * places.clamp(0, size + 1) / (size + 1)).square()
 
 
-def _phase_surface(
-    first: Tensor, second: Tensor, fraction: Tensor, reach: tuple[int, int], pixel: tuple[float, float]
-) -> Tensor:
-    """Phase correlation of windows (L, N, h, w) at the lags -reach ... reach: (L, N, lags_y, lags_x).
+def _phase_surface(first: Tensor, second: Tensor, fraction: Tensor) -> Tensor:
+    """Phase correlation of windows (L, N, h, w) at the lags -LAGS ... LAGS: (L, N, lags_y, lags_x).
 
-    ``fraction`` (L, N, 2) is the shift of the Hann window of the second, ``pixel`` the size (y, x) of pixels, in px.
+    ``fraction`` (L, N, 2) is the shift of the Hann window of the second in px.
     """
     shape = first.shape[:2]
     first, second, fraction = first.flatten(0, 1), second.flatten(0, 1), fraction.flatten(0, 1)
@@ -186,18 +179,15 @@ def _phase_surface(
     u = torch.fft.rfftfreq(width, dtype=first.dtype, device=first.device)
     high = (u > 0.4)[None] & (v.abs() > 0.25)[:, None]  # cycles/px: noise only, after the Gaussian of 1 px
     noise = (magnitude * high).sum((-2, -1), keepdim=True) / high.sum()
-    low_pass = torch.exp(-((v[:, None] / pixel[0]).square() + (u / pixel[1]).square()) / (2 * 0.15**2))
+    low_pass = torch.exp(-(v[:, None].square() + u.square()) / (2 * 0.15**2))
     twice = torch.full_like(u, 2.0)  # rfft stores one half of the spectrum
     twice[0] = 1.0
     if width % 2 == 0:
         twice[-1] = 1.0
     weight = low_pass * twice / (magnitude + 10.0 * noise + torch.finfo(first.dtype).tiny)
     full = (magnitude * weight).sum((-2, -1))
-    transforms = []
-    for size, frequency in zip(reach, (v, u), strict=True):
-        lags = torch.arange(-size, size + 1, dtype=frequency.dtype, device=first.device)
-        angle = 2 * torch.pi * lags[:, None] * frequency
-        transforms.append(torch.polar(torch.ones_like(angle), angle))
+    lags = torch.arange(-LAGS, LAGS + 1, dtype=first.dtype, device=first.device)
+    transforms = [torch.exp(2j * torch.pi * lags[:, None] * frequency) for frequency in (v, u)]
     surface = (transforms[0] @ ((cross * weight) @ transforms[1].T)).real
     return (surface / full.clamp(min=torch.finfo(first.dtype).tiny)[:, None, None]).unflatten(0, shape)
 
@@ -208,91 +198,28 @@ def _phase_surface(
 def register_projection(task: BandTask) -> tuple[Tensor, Tensor]:
     """Offsets and quality of bands by correlation of profiles, the means of rows and of columns.
 
-    Across the rows, the profile of a band is too short for the search range. Windows that are eight search ranges tall
-    therefore give a smooth course of the offset first. With that shift, the bands give the offset along
-    the rows, and with both shifts the remaining offset across the rows.
+    The sum of the correlations along both axes has its peak where each of them has its own.
     """
-    places = task.places
-    course = _smooth_course(_search_rows(task)).round().long()
-    shift = task.start + torch.stack([torch.zeros_like(course), course], dim=-1)
-    # peaks near the edge of the search range are interpolated from lags beyond it
-    x, quality_x = _band_profiles(task, places, shift, (0, task.search + LAGS - 1))
-    shift[..., 0] += torch.nan_to_num(x).round().long()
-    y, quality_y = _band_profiles(task, places, shift, (2 * LAGS, 0))
-    offsets = torch.stack([task.start[..., 0] + x, shift[..., 1] + y], dim=-1)
-    good = torch.isfinite(offsets).all(-1) & ((offsets - task.start).abs() < task.search).all(-1)
-    return torch.where(good[..., None], offsets, torch.nan), torch.where(good, torch.minimum(quality_x, quality_y), 0.0)
+    shift, valid = _whole_pixels(task)
+    down, along = (_profile_correlation(task, shift, reach) for reach in ((LAGS, 0), (0, LAGS)))
+    top = task.places[..., 1] + shift[..., 1]
+    valid &= (top >= LAGS) & (top + task.height + LAGS <= task.first.shape[-2])
+    valid &= torch.minimum(down.amax(-1), along.amax(-1)) > 0.6  # profiles of a few dozen rows reach 0.6 by chance
+    return fine_offsets(task, shift, 0.5 * (down[..., :, None] + along[..., None, :]), valid)
 
 
-def _search_rows(task: BandTask) -> Tensor:
-    """Offsets across the rows (L, N) beyond the coarse one, from tall windows; NaN where there is no peak."""
-    num_rows = task.first.shape[-2]
-    tall = min(max(task.height, 8 * task.search), num_rows // 2)
-    tops = (task.tops + (task.height - tall) // 2).clamp(0, num_rows - tall)
-    reach = task.search + LAGS - 1
-    lefts = task.left[:, None], (task.left + task.coarse[:, 0])[:, None]
-    windows = [
-        take_windows(image, torch.zeros_like(left), left, num_rows, task.width)[:, 0]
-        for image, left in zip((task.first, task.second), lefts, strict=True)
-    ]
-    row_means = [functional.pad(_differences(window.mean(-1)), (1, 1)) for window in windows]
-    begin = tops + task.coarse[:, 1:] - reach
-    later = take_windows(row_means[1][..., None], begin, torch.zeros_like(begin), tall + 2 * reach, 1)[..., 0]
-    template = row_means[0][:, tops[:, None] + torch.arange(tall, device=begin.device)]
-    surface = _correlate_profiles(template, later)
-    lag_begin = begin[..., None] + torch.arange(2 * reach + 1, device=begin.device)
-    return _profile_peak(torch.where((lag_begin >= 0) & (lag_begin + tall <= num_rows), surface, -torch.inf))[0]
-
-
-def _smooth_course(course: Tensor) -> Tensor:
-    """Course (L, N) with gaps filled from the nearest band and outliers removed by a median over 5 bands."""
-    count = course.shape[-1]
-    order = torch.arange(count, device=course.device)
-    valid = torch.isfinite(course)
-    before = torch.where(valid, order, -1).cummax(-1).values
-    after = torch.where(valid, order, count).flip(-1).cummin(-1).values.flip(-1)
-    nearest = torch.where((before < 0) | ((after < count) & (after - order < order - before)), after, before)
-    filled = torch.nan_to_num(course.gather(-1, nearest.clamp(0, count - 1)))
-    padded = functional.pad(filled[:, None], (2, 2), mode="replicate")[:, 0]
-    return padded.unfold(-1, 5, 1).median(-1).values
-
-
-def _band_profiles(task: BandTask, places: Tensor, shift: Tensor, reach: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Offset of bands beyond ``shift`` along the axis whose ``reach`` (rows, columns) is not 0, (L, N), and quality."""
-    summed, moved, height, width = (-1 if reach[0] else -2), places + shift, task.height, task.width
+def _profile_correlation(task: BandTask, shift: Tensor, reach: tuple[int, int]) -> Tensor:
+    """Correlation (L, N, 2 LAGS + 1) of profiles at lags around ``shift`` along the axis whose ``reach`` is not 0."""
+    summed, places, height, width = (-1 if reach[0] else -2), task.places, task.height, task.width
+    left, top = (places + shift).unbind(-1)
     first = take_windows(task.first, places[..., 1], places[..., 0], height, width)
-    top, left = moved[..., 1] - reach[0], moved[..., 0] - reach[1]
-    second = take_windows(task.second, top, left, height + 2 * reach[0], width + 2 * reach[1])
-    surface = _correlate_profiles(_differences(first.mean(summed)), _differences(second.mean(summed)))
-    lags = torch.arange(-reach[0], reach[0] + 1, device=surface.device)
-    begin = moved[..., 1, None] + lags
-    inside = (begin >= 0) & (begin + task.height <= task.second.shape[-2])
-    offset, quality = _profile_peak(torch.where(inside, surface, -torch.inf))
-    significant = quality > 0.6  # profiles of a few dozen rows reach 0.6 by chance
-    return torch.where(significant, offset, torch.nan), torch.where(significant, quality, 0.0)
+    second = take_windows(task.second, top - reach[0], left - reach[1], height + 2 * reach[0], width + 2 * reach[1])
+    return _correlate_profiles(_differences(first.mean(summed)), _differences(second.mean(summed)))
 
 
 def _differences(profile: Tensor) -> Tensor:
     """Central differences without the ends, which suppress slow changes of brightness."""
     return profile[..., 2:] - profile[..., :-2]
-
-
-def _profile_peak(surface: Tensor) -> tuple[Tensor, Tensor]:
-    """Sub-pixel lag of the peaks of correlations (L, N, 2 reach + 1), NaN where there is none, and quality.
-
-    -infinity marks lags that leave the frame. A peak next to one, or at the edge of the search range of ``reach - LAGS
-    + 1``, is none.
-    """
-    flat = surface.flatten(0, 1)[..., None]
-    place, _ = integer_peak(flat)
-    around = cut_lags(flat, place, (LAGS - 1, 0))
-    whole = torch.isfinite(around).all(1)[:, 0]
-    position, value = subpixel_peak(torch.where(whole[:, None, None], around, 0.0))
-    lag = (place + position)[:, 0] - flat.shape[1] // 2
-    search = flat.shape[1] // 2 - LAGS + 1
-    good = whole & (lag.abs() < search) & torch.isfinite(lag)
-    lag, value = torch.where(good, lag, torch.nan), torch.where(good, value.clamp(0.0, 1.0), 0.0)
-    return lag.unflatten(0, surface.shape[:2]), value.unflatten(0, surface.shape[:2])
 
 
 def _correlate_profiles(template: Tensor, search: Tensor) -> Tensor:
