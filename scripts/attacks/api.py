@@ -91,8 +91,8 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     lines = [f"{t:.9g},{x:.9g},{y:.9g}" for t, (x, y) in zip(times.tolist(), path.tolist(), strict=True)]
     motion_file.write_text("\n".join(["time,x,y", *lines]))
     rates_file = folder / "rates.csv"
-    rates_file.write_text("\n".join(["time,gx,gy,gz", *(f"{line},0" for line in lines)]))
-    rates = rsv.read_gyroscope(rates_file, unit="rad/s")
+    rates_file.write_text("\n".join(["time,gx_rad_s,gy_rad_s,gz_rad_s", *(f"{line},0" for line in lines)]))
+    rates = rsv.read_gyroscope(rates_file)
     unit = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     pairs = torch.zeros(2, 3, dtype=torch.float64)
     values = (0.0, 1e-4, 1.0, 1e-4, unit, unit, 500.0, 1.0, 1e-4, 1e-6, pairs, unit, 0.01, unit[:2])
@@ -166,7 +166,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
         "process_stack": {"sink": new["new.npy"], **windows},
         "process_video": {"source": video, "sink": new["new.mkv"], "restoration": {"method": "dewarp"}},
         "psnr": {"image": restored, "reference": frames},
-        "read_gyroscope": {"path": rates_file, "unit": "rad/s", "time_unit": "s"},
+        "read_gyroscope": {"path": rates_file},
         "read_manifest": {"path": folder / "out.npy.manifest.json"},
         "read_motion": {"path": motion_file, "unit": "rad", "focal_length": 100.0},
         "read_vibration": {"path": folder / "vibration.json"},
