@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.arrays import Channels, FramesOrFiles
@@ -44,9 +42,6 @@ class RowTimeCalibration(
             for a calibration with flickering light.
         reliable: Whether a single row time explains the frames.
         findings: Each ``Reason`` why not; ``reasons`` has their texts.
-        light: (T, H) light of the rows of each frame over its mean, without the brightness of the scene; None without
-            flickering light.
-        fitted_light: (T, H) the bands that were fitted to it.
     """
 
     row_time: float | None
@@ -60,8 +55,6 @@ class RowTimeCalibration(
     candidates: tuple[float, ...] = ()
     reliable: bool = True
     findings: tuple[Reason, ...] = ()
-    light: Tensor | None = None
-    fitted_light: Tensor | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -162,8 +155,6 @@ def calibrate_row_time(
         frame_rows=None if frame_rate is None else 1 / (frame_rate * row_time),
         readout_direction=direction,
         notes=tuple(notes),
-        light=torch.from_numpy(bands.fitted + bands.residual),
-        fitted_light=torch.from_numpy(bands.fitted),
     )
 
 

@@ -58,8 +58,6 @@ class BandFit:
     period: float  # P in rows
     period_std: float  # its standard deviation in rows, from the residuals with their correlation
     coefficients: Array  # (T, K) complex128, waveform of each frame over its mean
-    fitted: Array  # (T, H) float64, light of the rows over its mean: ``1 + sum_k Re[c_pk exp(-2 pi j k i / P)]``
-    residual: Array  # (T, H) float64, residual brightness over that of the scene
     # power of the fundamental over that of residuals at frequencies beside it, in all frames of a fixed scene together
     certainty: float
     evidence: float  # Gaussian log-likelihood less half the number of parameters times log N (BIC)
@@ -190,8 +188,6 @@ def _fit(brightness: Array, period: float, scene: SceneModel, count: int) -> Ban
         period=period,
         period_std=max(period_std, _period_std_beside(leverage, shift, certainty, period)),
         coefficients=coefficients,
-        fitted=pattern,
-        residual=residual,
         certainty=certainty,
         evidence=evidence - 0.5 * 2 * count * frames * math.log(values),
     )
