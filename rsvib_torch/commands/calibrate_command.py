@@ -50,7 +50,7 @@ class CalibrateOptions:
 
 
 def calibrate(given: CalibrateOptions) -> Answer:
-    """Measure row time and readout direction with a flickering light or motion.
+    """Measure the row time with a flickering light, or row time and readout direction with motion.
 
     With --by-motion, a row time that is not certain is refused with the
     reason.
@@ -93,7 +93,8 @@ def calibrate(given: CalibrateOptions) -> Answer:
     period: Table = {"frame_rate": None} if result.frame_rows is None else {"frame_rows": result.frame_rows}
     values: Table = {"row_time": result.row_time, "row_time_std": result.row_time_std}
     values |= {"exposure_time": given.exposure} | period
-    values |= {"scan_axis": given.scan_axis, "readout_direction": result.readout_direction}
+    direction = {"readout_direction": result.readout_direction} if given.by_motion else {}
+    values |= {"scan_axis": given.scan_axis} | direction
     table = sensor_toml(values, ["Written by rsvib calibrate.", *result.notes])  # unknown values are comments
     rows = stack.shape[of_both["scan_axis"]]
     readout = measured_text(1e3 * result.row_time * rows, 1e3 * result.row_time_std * rows)

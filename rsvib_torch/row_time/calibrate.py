@@ -1,6 +1,5 @@
-"""Row time and readout direction of a camera from frames of flickering light."""
+"""Row time of a camera from frames of flickering light."""
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,10 +9,9 @@ from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.arrays import Channels, FramesOrFiles
 from rsvib_torch.checks.validation import Positive
 from rsvib_torch.checks.values import check_number
-from rsvib_torch.numerics.tables import Array
 from rsvib_torch.results.presentation import JudgedResult
 from rsvib_torch.results.reason import Reason
-from rsvib_torch.row_time.flicker import MIN_PERIODS, BandFit, find_bands, row_profiles
+from rsvib_torch.row_time.flicker import MIN_PERIODS, find_bands, row_profiles
 from rsvib_torch.text import measured_text, wrapped
 
 ScanAxis = Literal[-2, -1, "y", "x"]
@@ -36,7 +34,7 @@ class RowTimeCalibration(
         contrast: Amplitude of the bands' fundamental over their mean, at most 2; None without flickering light.
         flicker_frequency: In Hz, as given or found; None without flickering light.
         frame_rows: Row times from one frame to the next, where the frame rate is known.
-        readout_direction: ``"forward"`` or ``"reverse"``, from bands that move between frames.
+        readout_direction: ``"forward"`` or ``"reverse"``, from the motion of the frames; None if it is unknown.
         notes: Reasons for undetermined values, and warnings.
         candidates: Row times in seconds that explain the motion of the frames, negative for a reverse readout; empty
             for a calibration with flickering light.
@@ -96,8 +94,8 @@ def calibrate_row_time(
     number of harmonics that maximises the evidence. Shading along the rows is part of the fit; several frames of a
     still scene whose bands lie at different rows eliminate its texture.
 
-    With a frame rate the bands' phase from frame to frame, ``f / frame_rate`` turns, determines the readout direction,
-    unless it is close to a whole or half number of turns.
+    Bands do not show the readout direction: it is that of most cameras, ``"forward"``, unless detection names another
+    one, see ``detect_vibration``.
 
     Args:
         frames: (T, H, W) or (T, C, H, W); floats of full scale 1, integers, or files.
@@ -144,16 +142,13 @@ def calibrate_row_time(
         _check_readout(row_time, frequency, height, frame_rate)
     if scene == "smooth" and len(profiles.rows) > 1:
         notes.append("the bands lie at the same rows in all frames, or the scene moves: its texture is not eliminated")
-    direction, contrast, why = _direction(bands, frequency, frame_rate)
-    notes += [f"readout direction unknown: {why}"] if why else []
     return RowTimeCalibration(
         row_time=row_time,
         row_time_std=row_time * bands.period_std / bands.period,
         period_rows=bands.period,
-        contrast=contrast,
+        contrast=float(np.abs(bands.coefficients[:, 0]).mean()),
         flicker_frequency=frequency,
         frame_rows=None if frame_rate is None else 1 / (frame_rate * row_time),
-        readout_direction=direction,
         notes=tuple(notes),
     )
 
@@ -174,42 +169,3 @@ def _check_readout(row_time: float, frequency: float, height: int, frame_rate: f
             f"flicker_frequency={frequency:g} Hz is ambiguous: row times of {listed} us cause the same bands; "
             f"use at most {0.5 / longest:.0f} Hz"
         )
-
-
-def _direction(
-    bands: BandFit, frequency: float, frame_rate: float | None
-) -> tuple[Literal["forward", "reverse"] | None, float, str]:
-    """Readout direction from consecutive frames, contrast of the light, and why the direction is undetermined.
-
-    The pattern of the scene does not move: the fundamental of frame p is ``d + a exp(-2 pi j p f / frame_rate)`` for
-    forward readout, with the opposite sign of the exponent for reverse readout.
-    """
-    first = bands.coefficients[:, 0]
-    contrast = float(np.abs(first).mean())
-    if len(first) < 2:
-        return None, contrast, "it requires two consecutive frames"
-    if frame_rate is None:
-        return None, contrast, "it requires the frame rate"
-    turns = frequency / frame_rate
-    # turns from the nearest whole or half number; the clocks of light and camera may differ by 1e-4
-    if abs((2 * turns + 0.5) % 1.0 - 0.5) / 2 < 0.03 + 1e-4 * turns * (len(first) - 1):
-        return None, contrast, f"the light makes {turns:.3f} turns a frame, too close to a whole or half number"
-    misfits, amplitudes = zip(*(_turning(first, sign * turns) for sign in (-1, 1)), strict=True)
-    good, bad = min(misfits), max(misfits)
-    if good > 0.1:
-        why = "the motion of the bands does not agree with flicker frequency and frame rate (29.97 is not 30)"
-        return None, contrast, f"{why}: {turns % 1:.3f} turns a frame"
-    if bad < 4.0 * good + 0.01:
-        return None, contrast, "texture of the scene hides the motion of the bands; use more frames, or a plain scene"
-    forward = misfits[0] < misfits[1]
-    return ("forward" if forward else "reverse"), amplitudes[0 if forward else 1], ""
-
-
-def _turning(values: Array, turns: float) -> tuple[float, float]:
-    """Misfit of ``d + a exp(2 pi j p turns)`` to values (T,) over their power with a penalty on d, and |a|."""
-    count = len(values)
-    columns = np.stack([np.ones(count), np.exp(2j * math.pi * turns * np.arange(count))], 1)
-    penalty = 0.3 if count == 2 else 0.03  # two frames alone cannot separate d from a
-    solution = np.linalg.solve(columns.conj().T @ columns + np.diag([penalty, 0.0]), columns.conj().T @ values)
-    cost = (np.abs(values - columns @ solution) ** 2).sum() + penalty * np.abs(solution[0]) ** 2
-    return float(cost / (np.abs(values) ** 2).sum()), float(np.abs(solution[1]))
