@@ -91,10 +91,9 @@ def calibrate(given: CalibrateOptions) -> Answer:
     if result.row_time is None or result.row_time_std is None or not result.reliable:
         raise ValueError(f"the row time is not certain: {'; '.join(result.reasons)}")
     period: Table = {"frame_rate": None} if result.frame_rows is None else {"frame_rows": result.frame_rows}
-    values: Table = {"row_time": result.row_time, "row_time_std": result.row_time_std}
-    values |= {"exposure_time": given.exposure} | period
     direction = {"readout_direction": result.readout_direction} if given.by_motion else {}
-    values |= {"scan_axis": given.scan_axis} | direction
+    values: Table = {name: getattr(result, name) for name in ("row_time", "row_time_std")}
+    values |= {"exposure_time": given.exposure} | period | {"scan_axis": given.scan_axis} | direction
     table = sensor_toml(values, ["Written by rsvib calibrate.", *result.notes])  # unknown values are comments
     rows = stack.shape[of_both["scan_axis"]]
     readout = measured_text(1e3 * result.row_time * rows, 1e3 * result.row_time_std * rows)
