@@ -28,10 +28,8 @@ from .evaluation import ssim as ssim
 from .export import write_gcsv as write_gcsv
 from .gyroscope import AngularRates as AngularRates
 from .gyroscope import ClockAlignment as ClockAlignment
-from .gyroscope import MotionCheck as MotionCheck
 from .gyroscope import RotationAlignment as RotationAlignment
 from .gyroscope import align_motion as align_motion
-from .gyroscope import check_motion as check_motion
 from .gyroscope import read_gyroscope as read_gyroscope
 from .imaging import Optics as Optics
 from .imaging import RowVaryingBlur as RowVaryingBlur

@@ -47,7 +47,6 @@ MotionUnit = Literal["px", "rad", "mrad", "urad", "deg", "arcsec", "rad/s", "deg
 PriorName = Literal["gaussian", "edges"]
 Registration = Literal["projection", "ncc", "phase"]
 RestorationName = Literal["exact", "banded", "dewarp", "richardson-lucy"]
-TimeUnit = Literal["s", "ms", "us", "ns"]
 
 Columns = Annotated[int, Field(ge=64, le=2**31)]  # px; narrower bands are often registered wrongly
 Frames = Annotated[int, Field(ge=2, le=2**31)]

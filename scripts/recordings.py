@@ -55,8 +55,6 @@ def light(folder: Path) -> None:
     for count, name in ((rows - 1, "from the first row to the last"), (rows, "of all rows")):
         readout = 1e3 * found.row_time * count
         print(f"     readout {name}: {readout:.4f} ms, {100 * (readout / 15.730 - 1):+.3f} % from 15.730 +- 0.004 ms")
-    found = rsv.calibrate_row_time(frame, 1000.0, on_fraction=0.5, gamma=2.2)
-    print(f"     exposure 1/{1 / (found.exposure_time or 1):.0f} s, with gamma 2.2 and a square wave")
 
 
 # Row time from motion
@@ -131,9 +129,8 @@ def phone(folder: Path) -> None:
             frames[part],
             timing,
             rates,
-            camera=PHONE_CAMERA,
+            camera=PHONE_CAMERA if "known" in name else None,
             offsets=CLOCK_RANGE,
-            fit_gain="known" not in name,
             fit_row_time=True,
             ignore=ignore,
         )

@@ -125,7 +125,6 @@ CASES = (
             FRAMES,
         ),
         "detect_vibration, bands": (partial(detect, method="bands", harmonics=2), FRAMES),
-        "check_motion": (lambda frames: rsv.check_motion(frames, TIMING, MOTION), FRAMES),
         "align_motion": (lambda frames: rsv.align_motion(frames, TIMING, MOTION, offsets=(-0.002, 0.002)), FRAMES),
         "restoration_mtf": (lambda frames: rsv.restoration_mtf(frames, TIMING, VIBRATION, joint=True, scale=2), FRAMES),
         "restore, holes": (lambda frames, ignore: restore(frames, ignore=ignore, **HARD), FRAMES, FRAMES > 0.8),

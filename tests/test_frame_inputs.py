@@ -41,7 +41,6 @@ def rms(values):
 FUNCTIONS = {
     "detect_vibration": lambda frames, **options: rsv.detect_vibration(frames, TIMING, tones=1, **options),
     "detect_motion": lambda frames, **options: rsv.detect_motion(frames, TIMING, **options),
-    "check_motion": lambda frames, **options: rsv.check_motion(frames, TIMING, VIBRATION, **options),
     "VibrationDetector": lambda frames, **options: rsv.VibrationDetector(TIMING, tones=1, **options)(frames),
     "register_bands": lambda frames, **options: rsv.register_bands(frames, TIMING, **options),
     "judge_restoration": lambda frames, **options: rsv.judge_restoration(frames, frames, TIMING, VIBRATION, **options),

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rsvib_torch.results.presentation import Result
 
 
-_CURVES = {"motion", "times", "displacement", "offsets", "residual", "light", "fitted_light", "measured", "predicted"}
+_CURVES = {"motion", "times", "displacement", "offsets", "residual", "measured", "predicted"}
 
 
 def without_curves(result: Result) -> Table:

@@ -1,4 +1,4 @@
-"""The command ``calibrate``: row time and exposure from frames."""
+"""The command ``calibrate``: row time from frames."""
 
 from pathlib import Path
 from typing import Literal
@@ -30,16 +30,12 @@ class CalibrateOptions:
     """Use the motion of the camera instead of a light."""
     flicker_frequency: float | None = option(None, "--frequency")
     """Flicker frequency in Hz; a mains-powered light flickers at twice the mains frequency."""
-    on_fraction: float | None = None
-    """Duty cycle of a light that is switched on and off; determines the exposure time."""
-    gamma: float | None = option(None, show_default="1")
-    """With --frequency: exponent that makes pixel values proportional to light."""
     row_time: list[float] | None = option(
         None, show_default="a readout within a tenth to the whole of the frame period", **shared.TIME
     )
     """With --by-motion: given twice, the shortest and the longest possible row time, e.g. 10us."""
-    exposure: float | None = option(None, **shared.TIME)
-    """With --by-motion, if known: exposure time, e.g. 1/1000."""
+    exposure: float | None = option(None, show_default="left open in the file", **shared.TIME)
+    """Exposure time, e.g. 1/1000: the setting of the camera."""
     readout_direction: Literal["forward", "reverse"] | None = option(None, show_default="determined from the frames")
     """With --by-motion, if known: forward if the top row (or left column) is read first, reverse if the last one is."""
     frame_rate: float | None = option(None, **shared.SENSOR_FORMS["frame_rate"])
@@ -54,23 +50,18 @@ class CalibrateOptions:
 
 
 def calibrate(given: CalibrateOptions) -> Answer:
-    """Measure row time and exposure with a flickering light or motion.
+    """Measure the row time with a flickering light, or row time and readout direction with motion.
 
-    The readout direction is measured as well. With --by-motion, a row time that is not certain is refused with the
+    With --by-motion, a row time that is not certain is refused with the
     reason.
     """
-    light: Table = {
-        "flicker_frequency": given.flicker_frequency,
-        "on_fraction": given.on_fraction,
-        "gamma": given.gamma,
-    }
+    light: Table = {"flicker_frequency": given.flicker_frequency}
     limits = None if given.row_time is None else tuple(given.row_time)
-    motion: Table = {"row_time": limits, "exposure_time": given.exposure}
-    motion["readout_direction"] = given.readout_direction
+    motion: Table = {"row_time": limits, "readout_direction": given.readout_direction}
     chosen, others = (motion, light) if given.by_motion else (light, motion)
     if any(value is not None for value in others.values()):
-        listed = "--frequency, --on-fraction and --gamma are for a flickering light, not for --by-motion"
-        listed = listed if given.by_motion else "--row-time, --exposure and --readout-direction are for --by-motion"
+        listed = "--frequency is for a flickering light, not for --by-motion"
+        listed = listed if given.by_motion else "--row-time and --readout-direction are for --by-motion"
         raise ValueError(f"{listed}; leave them out")
     if not given.by_motion and given.flicker_frequency is None:
         raise ValueError("give --frequency of the flicker, or --by-motion for frames of a vibrating camera")
@@ -85,6 +76,8 @@ def calibrate(given: CalibrateOptions) -> Answer:
     for sentence in (sentence for info in infos for sentence in io.describe_stack(info, None)):
         note(sentence)
     of_both: Table = {name: value for name, value in chosen.items() if value is not None}
+    if given.by_motion and given.exposure is not None:
+        of_both["exposure_time"] = given.exposure
     of_both |= {"frame_rate": given.frame_rate, "scan_axis": -1 if given.scan_axis == "x" else -2}
     if given.by_motion and given.frame_rate is None:
         of_both["frame_rate"] = shared.rate_of_file(paths[0])
@@ -98,8 +91,9 @@ def calibrate(given: CalibrateOptions) -> Answer:
     if result.row_time is None or result.row_time_std is None or not result.reliable:
         raise ValueError(f"the row time is not certain: {'; '.join(result.reasons)}")
     period: Table = {"frame_rate": None} if result.frame_rows is None else {"frame_rows": result.frame_rows}
-    values = {name: getattr(result, name) for name in ("row_time", "row_time_std", "exposure_time")} | period
-    values |= {"scan_axis": given.scan_axis, "readout_direction": result.readout_direction}
+    direction = {"readout_direction": result.readout_direction} if given.by_motion else {}
+    values: Table = {name: getattr(result, name) for name in ("row_time", "row_time_std")}
+    values |= {"exposure_time": given.exposure} | period | {"scan_axis": given.scan_axis} | direction
     table = sensor_toml(values, ["Written by rsvib calibrate.", *result.notes])  # unknown values are comments
     rows = stack.shape[of_both["scan_axis"]]
     readout = measured_text(1e3 * result.row_time * rows, 1e3 * result.row_time_std * rows)

@@ -19,8 +19,6 @@ from rsvib_torch.files.reading import Table
 from rsvib_torch.options import MotionUnit, ProcessStackOptions
 
 if TYPE_CHECKING:
-    import torch
-
     from rsvib_torch.io.stack_info import StackInfo
 
 
@@ -77,9 +75,9 @@ class RestoreOptions(shared.RestorationCommand):
 def restore(given: RestoreOptions) -> Answer:
     """Restore a stack of frames with a detected vibration or a recorded motion.
 
-    A recorded motion, of a gyroscope or an attitude sensor, is compared with the offsets of rows between the frames,
-    and refused if it does not explain them. If the restored frames are judged no better than the input, the input is
-    written unchanged. --force restores in both cases.
+    The offset of a recorded motion, of a gyroscope or an attitude sensor, is stated (--offset), or found by the offsets
+    of rows between the frames: a motion that does not explain them is refused. If the restored frames are judged no
+    better than the input, the input is written unchanged. --force restores in both cases.
     """
     settings, frames, vibration = given.settings, given.frames, given.vibration
     outputs, replaces = (
@@ -101,7 +99,7 @@ def restore(given: RestoreOptions) -> Answer:
         of_run |= {"given": [detected], "window": max(2, info.shape[0])}
         answer = Answer({"Vibration": [detected.summary()]}, {"detection": answers.detection_data(detected)})
     elif given.motion is not None and vibration is None:
-        answer = Answer({}, {"alignment": None, "check": None})
+        answer = Answer({}, {"alignment": None})
         of_run["motion"], timing = _motion_of_frames(given, given.motion, replace(info, full_scale=scale), answer)
         of_run["window"] = given.processing.get("window", settings.stack.get("window", 8))
     else:
@@ -119,7 +117,7 @@ def restore(given: RestoreOptions) -> Answer:
 def _motion_of_frames(
     given: RestoreOptions, path: Path, info: StackInfo, answer: Answer
 ) -> tuple[rsvib_torch.FreeMotion, rsvib_torch.SensorTiming]:
-    """A recorded motion on the clock of the frames, which is stated or estimated, if it explains their offsets.
+    """A recorded motion on the clock of the frames, which is stated or estimated.
 
     The second value is the timing of the frames, with the row time by ``--fit-row-time``.
     """
@@ -147,11 +145,6 @@ def _motion_of_frames(
                 frame_rows=rows * timing.frame_rows,
                 row_time_std=found.row_time_std,
             )
-    if isinstance(recorded, rsvib_torch.FreeMotion):  # rates were compared by the alignment
-        check = _check_motion(given, info, timing, placed, ignore)
-        if check is not None:
-            answer.results["Motion of the frames"] = [check.summary()]
-            answer.data["check"] = answers.without_curves(check)
     return placed, timing
 
 
@@ -197,30 +190,3 @@ def _refuse(given: RestoreOptions, reasons: tuple[str, ...]) -> None:
         raise ValueError(f"{given.motion}: {'; '.join(reasons)}; --force restores with it nevertheless")
     for reason in reasons:
         warn(reason)
-
-
-def _check_motion(
-    given: RestoreOptions,
-    info: StackInfo,
-    timing: rsvib_torch.SensorTiming,
-    motion: rsvib_torch.FreeMotion,
-    ignore: torch.Tensor | None,
-) -> gyroscope.MotionCheck | None:
-    """Compare the offsets of rows before and after correction with a motion, and refuse a motion that enlarges them.
-
-    Of a long stack, frames in its middle are compared. If the clock is stated, an error is a warning.
-    """
-    try:
-        with working("comparing the motion"):
-            check = stacks.check_stack_motion(given.frames, info, timing, motion, ignore)
-    except ValueError as error:
-        if given.offset is None:
-            raise
-        warn(f"cannot determine whether the motion fits: {error}")
-        return None
-    if check.helps:
-        for reason in check.reasons:
-            warn(reason)
-    else:
-        _refuse(given, check.reasons)
-    return check

@@ -1,4 +1,4 @@
-from .alignment import ClockAlignment, MotionCheck, align_motion, check_motion
+from .alignment import ClockAlignment, align_motion
 from .gpmf_track import CameraTrack, read_camera_track
 from .gyroscope_rates import AngularRates
 from .read_gyroscope import read_gyroscope
@@ -9,10 +9,8 @@ __all__ = [
     "AngularRates",
     "CameraTrack",
     "ClockAlignment",
-    "MotionCheck",
     "RotationAlignment",
     "align_motion",
-    "check_motion",
     "read_camera_track",
     "read_gyroscope",
 ]

@@ -1,4 +1,4 @@
-"""A motion that another instrument recorded: alignment with the clock of the frames, and comparison with them.
+"""A motion that another instrument recorded: alignment with the clock of the frames.
 
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.checks.arrays import FramesOrFiles
-from rsvib_torch.checks.values import check_single, described
+from rsvib_torch.checks.values import check_single
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.grouped_frames import grouped_frames
 from rsvib_torch.detection.shapes.free import record_of, residual_of_motion, rms_motion, start_of_stack
@@ -26,21 +26,16 @@ from rsvib_torch.frames.orientation import (
     magnitudes_from_row_order,
     offsets_from_row_order,
     reasons_from_row_order,
-    sequence_from_row_order,
 )
 from rsvib_torch.gyroscope.corner_tracks import corner_tracks
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
 from rsvib_torch.gyroscope.rotation_alignment import AlignOptions, RotationAlignment, align_rates, offset_range, outside
-from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array, scaled_inverse, table, tensor
-from rsvib_torch.options import OffsetOptions
-from rsvib_torch.results.presentation import AXIS_NAMES, JudgedResult
+from rsvib_torch.results.presentation import JudgedResult
 from rsvib_torch.results.reason import Reason
-from rsvib_torch.text import measured_text, text_table, wrapped
-
-_MIN_CHANGE = 0.05  # px, registration errors of bands
+from rsvib_torch.text import measured_text, wrapped
 
 P = ParamSpec("P")
 
@@ -54,12 +49,11 @@ class ClockAlignment(
     """Time of the frames within a recorded motion: ``scale t + offset`` on its clock.
 
     Attributes:
-        motion: The motion in image axes on the clock of the frames, with gain and drift.
+        motion: The motion in image axes on the clock of the frames, with drift.
         offset: Reading of the recording's clock at time 0 of the frames, in seconds.
         offset_std: Its standard deviation.
         scale: Seconds on the recording's clock per second of the frames.
         scale_std: Its standard deviation; 0 if it was not fitted.
-        gain: Factor of the recorded motion of each axis (x, y); 1 if it was not fitted.
         drift: (2,) px/s that the recording does not contain, as gyroscopes drift.
         unexplained: (2,) px, rms displacement of rows that the aligned motion does not explain, beyond their noise.
         reliable: Whether the recording explains the measurements, at this offset only.
@@ -71,26 +65,22 @@ class ClockAlignment(
     offset_std: float
     scale: float
     scale_std: float
-    gain: tuple[float, float]
     drift: Tensor
     unexplained: Tensor
     reliable: bool
     findings: tuple[Reason, ...]
 
     def summary(self) -> str:
-        """Offset and scale of the clock with standard deviations, gain, drift, and the verdict."""
+        """Offset and scale of the clock with standard deviations, drift, and the verdict."""
         verdict = "reliable" if self.reliable else f"not reliable: {'; '.join(self.reasons)}"
         drift, left = self.drift.tolist(), self.unexplained.tolist()
         second = measured_text(self.scale, self.scale_std or None, digits=8)
-        return "\n".join(
-            [
-                f"time 0 of the frames is {measured_text(self.offset, self.offset_std)} s of the recording",
-                f"1 s of the frames is {second} s of the recording",
-                f"x: recorded motion times {self.gain[0]:.4f}, drift {drift[0]:.3g} px/s, {left[0]:.2g} px unexplained",
-                f"y: recorded motion times {self.gain[1]:.4f}, drift {drift[1]:.3g} px/s, {left[1]:.2g} px unexplained",
-                wrapped(verdict),
-            ]
-        )
+        clock = [
+            f"time 0 of the frames is {measured_text(self.offset, self.offset_std)} s of the recording",
+            f"1 s of the frames is {second} s of the recording",
+        ]
+        axes = [f"{name}: drift {drift[k]:.3g} px/s, {left[k]:.2g} px unexplained" for k, name in enumerate("xy")]
+        return "\n".join([*clock, *axes, wrapped(verdict)])
 
 
 @dataclass(frozen=True)
@@ -99,7 +89,6 @@ class FittedClock:
 
     at: float
     scale: float
-    gain: tuple[float, float]
     drift: tuple[float, float]
     middle: float
 
@@ -110,7 +99,7 @@ class FittedClock:
 
     def motion(self, recorded: FreeMotion) -> FreeMotion:
         """The recorded motion on the clock of the frames."""
-        moved = recorded.retimed(self.offset, self.scale, self.gain)
+        moved = recorded.retimed(self.offset, self.scale)
         knots = moved.knots - self.middle
         drift = knots.new_tensor(self.drift)[:, None] * knots
         return FreeMotion(moved.coefficients + drift, moved.start, moved.spacing, moved.tones, moved.camera)
@@ -205,16 +194,16 @@ def align_motion(
     turned = recorded.to_row_order(timing).to("cpu")
     low, high = offset_range(turned.start, turned.end, first, last, options.offsets)
     offset, other = best_offset(measured, turned, low, high, rowwise)
-    clock = FittedClock(offset + 0.5 * (first + last), 1.0, (1.0, 1.0), (0.0, 0.0), 0.5 * (first + last))
-    clock, _ = fit_clock(measured, turned, clock, False, options.fit_gain)
+    clock = FittedClock(offset + 0.5 * (first + last), 1.0, (0.0, 0.0), 0.5 * (first + last))
+    clock, _ = fit_clock(measured, turned, clock, False)
     weighed = measured.reweighted(residual_of_motion(measured, clock.motion(turned)))
-    clock, covariance = fit_clock(weighed, turned, clock, options.fit_scale, options.fit_gain)
+    clock, covariance = fit_clock(weighed, turned, clock, options.fit_scale)
     rows = grouped_frames(grey, stack.valid, rowwise, clock.motion(turned).expanded(1).to(grey.device))
     for _ in range(3):
         moved = clock.motion(turned).expanded(1).to(grey.device)
         measured = rows.measure(moved, keep_images=False).measurements
         weighed = measured.reweighted(residual_of_motion(measured, clock.motion(turned)))
-        clock, covariance = fit_clock(weighed, turned, clock, options.fit_scale, options.fit_gain)
+        clock, covariance = fit_clock(weighed, turned, clock, options.fit_scale)
     aligned = clock.motion(turned)
     residual = residual_of_motion(measured, aligned)
     covariance = covariance / measured.independent_fraction(residual)
@@ -225,15 +214,13 @@ def align_motion(
     reasons = recording_reasons(rms_motion(measured, aligned).tolist(), rest.tolist(), other)
     reasons += outside(clock.offset, offset_std, options.offsets)
     drift = offsets_from_row_order(torch.tensor(clock.drift, dtype=torch.float64, device="cpu"), timing)
-    gain_x, gain_y = sequence_from_row_order(clock.gain, timing)
-    in_image = replace(clock, gain=(gain_x, gain_y), drift=(float(drift[0]), float(drift[1])))
+    in_image = replace(clock, drift=(float(drift[0]), float(drift[1])))
     return ClockAlignment(
         motion=in_image.motion(recorded),
         offset=clock.offset,
         offset_std=offset_std,
         scale=clock.scale,
         scale_std=float(std[1]),
-        gain=in_image.gain,
         drift=drift,
         unexplained=magnitudes_from_row_order(tensor(rest), timing).to(grey.device),
         reliable=not reasons,
@@ -270,21 +257,20 @@ def best_offset(
 
 
 def fit_clock(
-    measured: Measurements, recorded: FreeMotion, clock: FittedClock, fit_scale: bool, fit_gain: bool
+    measured: Measurements, recorded: FreeMotion, clock: FittedClock, fit_scale: bool
 ) -> tuple[FittedClock, Array]:
-    """Gauss-Newton on clock reading, scale, gain and drift, from start values; also their covariance (6, 6)."""
+    """Gauss-Newton on clock reading, scale and drift, from start values; also their covariance (4, 4)."""
     starts = measured.exposure_starts
-    free = np.array([True, fit_scale, fit_gain, fit_gain, True, True])
+    free = np.array([True, fit_scale, True, True])
     for _ in range(12):
-        # 1. Displacement and velocity of the recording at the measured rows.
+        # 1. Velocity of the recording at the measured rows.
         middle = starts + 0.5 * measured.exposure_time - clock.middle
         in_time = recorded.retimed(clock.offset, clock.scale)
-        speed = table(in_time.velocity(tensor(starts + 0.5 * measured.exposure_time))) * clock.gain / clock.scale
-        value = table(in_time.mean_displacement(tensor(starts), measured.exposure_time))
-        # 2. Derivatives (1, N, G, 2, 6) of the displacements by the parameters.
+        speed = table(in_time.velocity(tensor(starts + 0.5 * measured.exposure_time))) / clock.scale
+        # 2. Derivatives (1, N, G, 2, 4) of the displacements by the parameters.
         x, y = np.eye(2)
         middle = middle[..., None]
-        columns = [speed, speed * middle, value * x, value * y, middle * x, middle * y]
+        columns = [speed, speed * middle, middle * x, middle * y]
         jacobian = measured.relative(np.stack(columns, -1)) * free
         # 3. The normal equations and the step.
         residual = residual_of_motion(measured, clock.motion(recorded))
@@ -295,130 +281,8 @@ def fit_clock(
         change = inverse @ right
         known = max(float(measured.num_measurements.sum()), 8.0) - free.sum()
         covariance = inverse * (measured.square(residual).sum() / known)
-        at, speed_of_clock, *others = (np.array([clock.at, clock.scale, *clock.gain, *clock.drift]) + change).tolist()
-        gain, drift = (others[0], others[1]), (others[2], others[3])
-        clock = FittedClock(at, max(speed_of_clock, 0.1 * clock.scale), gain, drift, clock.middle)
+        at, speed_of_clock, *drift = (np.array([clock.at, clock.scale, *clock.drift]) + change).tolist()
+        clock = FittedClock(at, max(speed_of_clock, 0.1 * clock.scale), (drift[0], drift[1]), clock.middle)
         if (np.abs(change) <= 1e-3 * np.sqrt(np.maximum(covariance.diagonal(), 0.0))).all():
             break
     return clock, covariance
-
-
-# Comparison
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class MotionCheck(
-    JudgedResult,
-    units={"before": "px", "after": "px", "times": "s", "offsets": "px", "residual": "px"},
-    shapes={"before": "2", "after": "2", "times": "N", "offsets": "N 2", "residual": "N 2"},
-):
-    """Offsets of rows between frames, before and after a given motion is subtracted.
-
-    Attributes:
-        before: (2,) px, rms offset of row bands between consecutive frames, axes (x, y), of the nine tenths that fit
-            best: the others may be clouds or registration errors.
-        after: (2,) px, the same of the offsets less those of the motion.
-        helps: Whether the motion reduces the offsets, both axes together.
-        findings: Each ``Reason`` against the motion; ``reasons`` has their texts.
-        times: (N,) s, exposure starts of the registered row bands in the earlier frame of their pair.
-        offsets: (N, 2) px, offsets of these bands, axes (x, y).
-        residual: (N, 2) px, these offsets less those of the motion.
-    """
-
-    before: Tensor
-    after: Tensor
-    helps: bool
-    findings: tuple[Reason, ...]
-    times: Tensor
-    offsets: Tensor
-    residual: Tensor
-
-    def summary(self) -> str:
-        """Offsets before and after the motion is subtracted, and the verdict."""
-        rows = [
-            [name, measured_text(before, digits=3), measured_text(after, digits=3)]
-            for name, before, after in zip("xy", self.before, self.after, strict=True)
-        ]
-        table = text_table(("axis", "offset between frames (px rms)", "without the motion (px rms)"), rows)
-        return "\n".join([table, "the motion reduces the offsets" if self.helps else "not reduced", *self.reasons])
-
-
-class _ChecksMotion(Protocol[P]):
-    """Type of ``check_motion``."""
-
-    def __call__(
-        self, frames: FramesOrFiles, timing: SensorTiming, motion: Motion, *args: P.args, **kwargs: P.kwargs
-    ) -> MotionCheck:
-        """Call the function."""
-
-
-def _check_options(options: Callable[P, OffsetOptions]) -> Callable[[Callable[..., MotionCheck]], _ChecksMotion[P]]:
-    return lambda function: entry_point(options, function)
-
-
-@_check_options(OffsetOptions)
-@full_precision
-@without_gradients
-def check_motion(frames: FramesOrFiles, timing: SensorTiming, motion: Motion, options: OffsetOptions) -> MotionCheck:
-    """Compare a given motion with the offsets of row bands between frames.
-
-    A motion with the wrong sign, clock or focal length makes frames worse: its subtraction increases the offsets.
-
-    Args:
-        frames: Stack (T, H, W) or (T, C, H, W) of at least two frames; tensor, array, list of these, or files; NaN
-            marks missing pixels.
-        timing: The sensor.
-        motion: A vibration or free motion in image axes, on the clock of the frames.
-        options: Options, as in ``detect_vibration``.
-
-    Returns:
-        Rms offsets with and without the motion, and a verdict.
-
-    Raises:
-        ValueError: If frames or motion are a batch, or the frames cannot be registered.
-
-    Example:
-        >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.datasets import example_frames
-        >>> frames, timing, vibration = example_frames()
-        >>> print(rsv.check_motion(frames, timing, vibration))
-        axis  offset between frames (px rms)  without the motion (px rms)
-        x     2.36                            0.0661
-        y     0.576                           0.0953
-        the motion reduces the offsets
-    """
-    if not isinstance(motion, Motion):
-        raise TypeError(f"motion must be a Motion, got {described(motion)}")
-    stack = grey_frames(frames, timing, options)
-    timing = stack.timing
-    check_single("motion", motion.batch_shape)
-    if stack.batched:
-        raise ValueError("check_motion takes one stack, not a batch")
-    measured = start_of_stack(stack, timing, options)[1].measurements
-    turned = motion.to("cpu").to_row_order(timing)
-    used = tensor(measured.weights[0].min(-1) > 0)
-
-    unexplained = residual_of_motion(measured, turned)
-    offsets, residual = (
-        offsets_from_row_order(tensor(np.diff(values[0], axis=1)[:, 0])[used], timing)
-        for values in (measured.displacements, unexplained)
-    )
-    before, after = _rms(offsets), _rms(residual)
-    findings = []
-    for name, moved, rest in zip(AXIS_NAMES, before.tolist(), after.tolist(), strict=False):
-        largest, expected = moved + _MIN_CHANGE, max(0.5 * moved, _MIN_CHANGE)
-        if rest > largest:
-            findings.append(Reason("motion_enlarges_offsets", name, rest, largest, {"moved": moved}))
-        elif rest > expected and moved > 2 * _MIN_CHANGE:
-            findings.append(Reason("motion_leaves_offsets", name, rest, expected, {"moved": moved}))
-    rest, moved = float(after.norm()), float(before.norm())
-    if rest >= moved and not findings:
-        findings.append(Reason("offsets_not_reduced", None, rest, moved))
-    times = tensor(measured.exposure_starts[0, :, 0])[used]
-    return MotionCheck(before, after, rest < moved, tuple(findings), times, offsets, residual)
-
-
-def _rms(offsets: Tensor) -> Tensor:
-    """(2,) rms of the smallest nine tenths of offsets (N, 2)."""
-    square = offsets.square().sort(dim=0).values
-    return square[: max(1, math.ceil(0.9 * len(square)))].mean(0).sqrt()

@@ -5,13 +5,12 @@ with the names of the columns, ``t,gx,gy,gz,...``; rates are numbers times ``gsc
 """
 
 import csv
-import math
 import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
 
+import numpy as np
 import torch
 
 from rsvib_torch.checks.arguments import checks_arguments
@@ -20,23 +19,20 @@ from rsvib_torch.files.number_table import rows_of_numbers, text_lines
 from rsvib_torch.files.reading import check_regular
 from rsvib_torch.gyroscope.gpmf_track import is_mp4, read_gpmf
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, orientation_matrix
-from rsvib_torch.motion.recorded import SECONDS, check_times
+from rsvib_torch.motion.recorded import check_times
 from rsvib_torch.numerics.tables import Array
-from rsvib_torch.options import TimeUnit
 from rsvib_torch.text import one_line, quoted
 
-RateUnit = Literal["rad/s", "deg/s"]
-_RADIANS = {"rad/s": 1.0, "deg/s": math.pi / 180}
 _COLUMN_NAME = re.compile(
-    r"(?:(?P<time>t|time|timestamp)|"
-    r"(?:gyro(?:scope)?[ _]?|angular_velocity[ _]?|rate[ _]?|omega[ _]?|[grw])?(?P<axis>[xyz]))"
-    r"(?:[ _]?[(\[]?(?P<unit>s|ms|us|ns|rad/s|rad_s|rads|deg/s|deg_s|dps)[)\]]?)?"
+    r"(?P<time>(?:t|time|timestamp)(?:[ _]?[(\[]?s[)\]]?)?)|"
+    r"(?:gyro(?:scope)?[ _]?|angular_velocity[ _]?|rate[ _]?|omega[ _]?|[grw])?(?P<axis>[xyz])"
+    r"(?:[ _]?[(\[]?(?P<unit>rad/s|rad_s|rads|deg/s|deg_s|dps)[)\]]?)?"
 )
 _MARKS = (b"GYROFLOW IMU LOG", b"CAMERA IMU LOG")  # at the begin of a gyroflow log
 _MAX_HEADER = 1000  # lines
 
 
-def _read_table(path: Path, is_log: bool, unit: str | None, time_unit: str | None) -> tuple[Array, Array, str, str]:
+def _read_table(path: Path, is_log: bool) -> tuple[Array, Array, str, str]:
     """As ``read_gpmf``, of a CSV file with units, or of a gyroflow log, whose header states factors and axes."""
     with path.open(newline="", encoding="utf-8-sig") as file:
         lines = text_lines(path, file)
@@ -49,19 +45,15 @@ def _read_table(path: Path, is_log: bool, unit: str | None, time_unit: str | Non
         axes = header.get("orientation", ["", "XYZ"])[1]
         scales = (_scale(path, header, name) for name in ("tscale", "gscale"))
         return times * next(scales), rates * next(scales), f"gyroflow log, orientation {axes}", axes
-    rate_units = {"rad/s" if name.startswith("rad") else "deg/s" for name in units[1:] if name}
-    rate_unit = _unit(path, "unit", rate_units, unit)
-    if rate_unit is None:
-        raise ValueError(f"{path}: the unit of the rates is not stated; pass unit='rad/s' or unit='deg/s'")
-    seconds = SECONDS[_unit(path, "time_unit", {*units[:1]} - {""}, time_unit) or "s"]
-    return times * seconds, rates * _RADIANS[rate_unit], "CSV", "XYZ"
+    if units not in ({"rad"}, {"deg"}):
+        raise ValueError(f"{path}: the first line states no unit of the rates, or two; write gx_rad_s or gx_deg_s")
+    return times, np.radians(rates) if units == {"deg"} else rates, "CSV", "XYZ"
 
 
-def _columns(path: Path, names: list[str]) -> tuple[list[int], list[str]]:
-    """Columns of the time and of the rates about x, y and z, and the unit that the name of each states, or nothing."""
+def _columns(path: Path, names: list[str]) -> tuple[list[int], set[str]]:
+    """Columns of the time and of the rates about x, y and z, and the units of the rates: rad, deg or nothing."""
     matches = [(column, match) for column, name in enumerate(names) if (match := _COLUMN_NAME.fullmatch(name))]
-    matches = [one for one in matches if not one[1]["unit"] or (one[1]["unit"] in SECONDS) == bool(one[1]["time"])]
-    columns, units = list[int](), list[str]()
+    columns, units = list[int](), set[str]()
     for quantity in ("time", "x", "y", "z"):
         found = [one for one in matches if quantity == ("time" if one[1]["time"] else one[1]["axis"])]
         if len(found) != 1:
@@ -69,20 +61,13 @@ def _columns(path: Path, names: list[str]) -> tuple[list[int], list[str]]:
             number = "no column" if not found else f"{len(found)} columns"
             present = one_line(", ".join(names) or "nothing", 200)
             raise ValueError(
-                f"{path}: {number} of the {what}; expected one each, with names such as time, gx, gy, gz in the line "
-                f"of names, which has {present}"
+                f"{path}: {number} of the {what}; expected one each, with names such as time, gx_rad_s, gy_rad_s, "
+                f"gz_rad_s in the line of names, which has {present}"
             )
         columns.append(found[0][0])
-        units.append(found[0][1]["unit"] or "")
+        if quantity != "time":
+            units.add((found[0][1]["unit"] or "").replace("dps", "deg")[:3])
     return columns, units
-
-
-def _unit(path: Path, name: str, stated: set[str], given: str | None) -> str | None:
-    """The only unit that the names of the columns state, or that is given; None if there is none."""
-    if len(stated | ({given} - {None})) > 1:
-        kinds = ", ".join(sorted(stated))
-        raise ValueError(f"{path}: the first line states {kinds}" + (f", {name} is {given!r}" if given else ""))
-    return given or next(iter(stated), None)
 
 
 def _header(path: Path, lines: Iterator[str]) -> tuple[dict[str, list[str]], int]:
@@ -107,9 +92,7 @@ def _scale(path: Path, header: dict[str, list[str]], name: str) -> float:
 
 
 @checks_arguments
-def read_gyroscope(
-    path: str | os.PathLike[str], *, unit: RateUnit | None = None, time_unit: TimeUnit | None = None
-) -> AngularRates:
+def read_gyroscope(path: str | os.PathLike[str]) -> AngularRates:
     """Read the angular rates of a gyroscope; the format is recognised by the content of the file.
 
     * gyroflow ``.gcsv``: rates times ``gscale`` in rad/s about the axes of the line ``orientation`` (``YxZ``: the rates
@@ -117,16 +100,14 @@ def read_gyroscope(
     * GoPro ``.mp4`` with a track of GPMF data (``gpmd``): the entries ``GYRO`` divided by ``SCAL``, about the axes of
       ``ORIN`` if there is one, otherwise in the order of the file. Times are those of the video: of the stamps of the
       camera, or of the ends of the packets with samples at equal distances.
-    * CSV: a first line with the names of the columns: a time (``t``, ``time``, ``timestamp``) and three rates (``x``,
-      ``gx``, ``gyro_x``, ``wx`` ...). The unit of the rates must be part of the names (``gx_rad_s``, ``x (deg/s)``) or
-      be given; that of the time is s unless it is part of the name (``time_ms``) or given.
+    * CSV: a first line with the names of the columns: a time in s (``t``, ``time``, ``timestamp``) and three rates
+      (``x``, ``gx``, ``gyro_x``, ``wx`` ...) with their unit (``gx_rad_s``, ``x (deg/s)``). Other files:
+      ``AngularRates(times, rates)``.
 
     ``align_motion`` determines which axis of the gyroscope is which axis of the camera.
 
     Args:
         path: The file.
-        unit: Unit of the rates of a CSV file whose names do not state it.
-        time_unit: Unit of its times.
 
     Returns:
         Times and rates on the clock of the gyroscope.
@@ -139,9 +120,9 @@ def read_gyroscope(
         >>> from pathlib import Path
         >>> import rsvib_torch as rsv
         >>> path = Path(tempfile.mkdtemp()) / "clip.csv"
-        >>> rows = [f"{2.5 * i},{0.1 * i},0,{-0.2 * i}" for i in range(5)]
-        >>> _ = path.write_text(chr(10).join(["time_ms,gx,gy,gz", *rows]))
-        >>> rates = rsv.read_gyroscope(path, unit="deg/s")
+        >>> rows = [f"{0.0025 * i},{0.1 * i},0,{-0.2 * i}" for i in range(5)]
+        >>> _ = path.write_text(chr(10).join(["time,gx_deg_s,gy_deg_s,gz_deg_s", *rows]))
+        >>> rates = rsv.read_gyroscope(path)
         >>> round(rates.sample_rate), rates.rates[4].rad2deg().tolist()
         (400, [0.4, 0.0, -0.8])
     """
@@ -151,10 +132,8 @@ def read_gyroscope(
         head = file.read(64)
     is_log = head.removeprefix(b"\xef\xbb\xbf").startswith(_MARKS)
     kind = "GoPro video with a GPMF track (.mp4)" if is_mp4(head) else "gyroflow log (.gcsv)" if is_log else "CSV file"
-    if kind != "CSV file" and (unit is not None or time_unit is not None):
-        raise ValueError(f"{path}: a {kind} states its units; omit unit and time_unit")
     try:
-        found = read_gpmf(path) if is_mp4(head) else _read_table(path, is_log, unit, time_unit)
+        found = read_gpmf(path) if is_mp4(head) else _read_table(path, is_log)
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{path}: not a {kind}: {error}") from error
     times, rates, source, axes = found
@@ -163,5 +142,5 @@ def read_gyroscope(
         result = AngularRates(torch.from_numpy(times.copy()), turned, f"{path.name}, {source}")
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    check_times(path, times, time_unit or "s", longest_gap=float("inf"))
+    check_times(path, times, longest_gap=float("inf"))
     return result

@@ -24,9 +24,6 @@ from rsvib_torch.results.reason import Reason
 from rsvib_torch.text import measured_text, text_table, wrapped
 
 _CERTAIN = 25.0  # chi-square by which other axes or offsets fit worse: 5 standard deviations of one parameter
-# Starts that are worse by less than this factor are fitted, at most three: with a dashboard and parallax, other axes
-# were better by 1 % in a simulated clip; without both, the second ones are worse by 16 % and more.
-_NEAR_COST = 1.05
 _MAX_COST, _MOST_OTHERS = 4.0, 5  # starts that are worse by this factor in the search, and further ones, are not fitted
 _MAX_FOCAL_LENGTH_STD, _MAX_ROW_TIME_STD = 0.05, 0.2  # of the value; less accurate ones are not determined
 # longer sides of the frames: of a fisheye lens, and of 1000 mm on film. Rates in degrees per second for rad/s fitted
@@ -181,11 +178,6 @@ class AlignOptions(OffsetOptions):
         "A result outside them is refused.",
     )
     fit_scale: bool = Field(default=True, description="Whether to fit the ratio of the speeds of the clocks.")
-    fit_gain: bool = Field(
-        default=False,
-        description="Whether to fit a factor of the recorded motion of each axis; with angular rates, the focal length "
-        "of the camera.",
-    )
     fit_row_time: bool = Field(
         default=False,
         description="Whether to fit the row time as well, with angular rates; ``timing`` has the start value.",
@@ -204,26 +196,18 @@ def align_rates(
     last += rows * timing.row_time + timing.exposure_time
     limits = offset_range(rates.start, rates.end, begin, last, offsets)
     middle = 0.5 * (begin + last)
-    fit_focal_length = camera is None or options.fit_gain
-    known = None if fit_focal_length else camera
-    free = (True, True, True, True, options.fit_scale, fit_focal_length, options.fit_row_time)
+    free = (True, True, True, True, options.fit_scale, camera is None, options.fit_row_time)
 
     def parameters(start: Start, row_time: float) -> Tensor:
         values = [0.0, 0.0, 0.0, start.offset + middle, 1.0, start.focal_length, row_time]
         return torch.tensor(values, dtype=torch.float64)
 
     # 1. Axes and offsets that explain the displacements best, and the fit from there with the smallest residuals.
-    search = search_orientations(tracks, tracks.roughly(), rates, timing.row_time, limits, known)
+    search = search_orientations(tracks, tracks.roughly(), rates, timing.row_time, limits, camera)
     lens = camera or Camera(search.starts[0].focal_length)
     first = search.starts[0]
-    near = [first, *(start for start in search.starts[1:3] if start.cost < _NEAR_COST * first.cost)]
     model = RotationModel(tracks, rates, first.orientation, lens, middle, free)
-    fits = [
-        fit_robustly(replace(model, orientation=start.orientation), parameters(start, timing.row_time))
-        for start in near
-    ]
-    fit = min(fits, key=lambda one: one.errors.sigma / float((one.errors.weight > 0).double().mean()))
-    first = near[fits.index(fit)]
+    fit = fit_robustly(model, parameters(first, timing.row_time))
 
     # 2. What does not follow the gyroscope has no weight in a second search, and parallax little.
     row_time = float(fit.parameters[6])

@@ -14,7 +14,7 @@ from rsvib_torch.checks.values import check_number
 from rsvib_torch.files.number_table import rows_of_numbers, text_lines
 from rsvib_torch.files.reading import check_regular
 from rsvib_torch.motion.spline import FreeMotion
-from rsvib_torch.options import MotionUnit, TimeUnit
+from rsvib_torch.options import MotionUnit
 from rsvib_torch.text import one_line
 
 _RADIANS = {
@@ -26,7 +26,6 @@ _RADIANS = {
     "rad/s": 1.0,
     "deg/s": math.pi / 180,
 }
-SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _COLUMNS = ("time", "x", "y")
 _LEAST_SAMPLES = 4  # of a cubic spline
 
@@ -34,15 +33,11 @@ Array = NDArray[np.float64]
 
 
 @checks_arguments
-def read_motion(
-    path: str | os.PathLike[str],
-    *,
-    unit: MotionUnit,
-    focal_length: float | None = None,
-    time_unit: TimeUnit = "s",
-    signs: tuple[float, float] = (1.0, 1.0),
-) -> FreeMotion:
+def read_motion(path: str | os.PathLike[str], *, unit: MotionUnit, focal_length: float | None = None) -> FreeMotion:
     """Read a recorded motion from a CSV file with the columns ``time``, ``x`` and ``y``; other columns are ignored.
+
+    Times are in s, on any clock. Of a file with other times, ``FreeMotion.from_samples`` makes the motion;
+    ``motion.with_axes([0, 1], [1, -1])`` is that with another direction of y.
 
     Angles displace the image by ``focal_length tan(angle)``; rates are integrated to angles first (trapezoidal rule).
     ``x`` is the quantity that displaces the image along x: for a camera, the angle about its y axis.
@@ -51,8 +46,6 @@ def read_motion(
         path: The CSV file; its first line names the columns.
         unit: Unit of x and y.
         focal_length: Focal length in px, required for angles and rates and not accepted for px.
-        time_unit: Unit of the times, which may be on any clock.
-        signs: 1 or -1 for each axis (x, y); -1 where a positive angle displaces the image in the negative direction.
 
     Returns:
         The motion without its mean, with the times of the file in seconds.
@@ -78,13 +71,10 @@ def read_motion(
         if focal_length is None:
             raise ValueError(f"unit={unit!r} needs a focal_length in px")
         check_number("focal_length", focal_length, above=0.0)
-    if any(abs(check_number("signs", sign)) != 1 for sign in signs):
-        raise ValueError(f"signs must be 1 or -1 for x and y, got {signs}")
     times, values = _table(path)
-    times = times * SECONDS[time_unit]
-    check_times(path, times, time_unit)
+    check_times(path, times)
     displacement = values if focal_length is None else _displacement(path, times, values, unit, focal_length)
-    displacement = (displacement - displacement.mean(0)) * np.asarray(signs)
+    displacement = displacement - displacement.mean(0)
     spacing = float(np.median(np.diff(times)))
     return FreeMotion.from_samples(torch.from_numpy(times), torch.from_numpy(displacement), spacing=spacing)
 
@@ -109,7 +99,7 @@ def _table(path: Path) -> tuple[Array, Array]:
     return table[:, 0], table[:, 1:]
 
 
-def check_times(path: Path, times: Array, unit: str, longest_gap: float = 4.0) -> None:
+def check_times(path: Path, times: Array, longest_gap: float = 4.0) -> None:
     """Raise a ValueError for times that do not increase, have gaps (in median steps), or are in another unit."""
     steps = np.diff(times)
     if (steps <= 0).any():
@@ -120,7 +110,7 @@ def check_times(path: Path, times: Array, unit: str, longest_gap: float = 4.0) -
         )
     typical = float(np.median(steps))
     if not 1e-6 <= typical <= 0.5:  # s; motion sensors sample at 2 Hz to 1 MHz
-        raise ValueError(f"{path}: samples are {typical:.3g} s apart; check time_unit={unit!r}")
+        raise ValueError(f"{path}: samples are {typical:.3g} s apart; times must be in s")
     if steps.max() > longest_gap * typical:
         place = int(np.argmax(steps))
         raise ValueError(

@@ -202,31 +202,31 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         count = self.coefficients.shape[-1]
         return self.start + self.spacing * (torch.arange(count, dtype=torch.float64, device=self.device) - 1.0)
 
-    def retimed(self, offset: float, scale: float = 1.0, gain: tuple[float, float] = (1.0, 1.0)) -> "FreeMotion":
-        """The motion on another clock: ``gain D(scale t + offset)`` at time t.
+    def retimed(self, offset: float, scale: float = 1.0) -> "FreeMotion":
+        """The motion on another clock: ``D(scale t + offset)`` at time t.
 
         Args:
             offset: Reading of this motion's clock at time 0, in seconds.
             scale: Seconds that pass on this motion's clock in one second.
-            gain: Factor of each axis (x, y), not negative where there are tones.
         """
         check_number("offset", offset)
         check_number("scale", scale, above=0.0)
-        size = self.coefficients.new_ones(self.num_axes)
-        size[:2] = size.new_tensor(gain)
         old = self.tones
         tones = replace(
             old,
-            amplitude=old.amplitude * size[:, None],
             frequency=old.frequency * scale,
             phase=old.phase + 2 * math.pi * old.frequency * offset,
-            image_motion=size * (old.image_motion + old.image_acceleration * offset) * scale,
-            image_acceleration=size * old.image_acceleration * scale**2,
-            image_shift=size * old.image_shift,
+            image_motion=(old.image_motion + old.image_acceleration * offset) * scale,
+            image_acceleration=old.image_acceleration * scale**2,
         )
         moved = old.image_motion * offset + 0.5 * old.image_acceleration * offset**2
-        rest = (self.coefficients + moved[..., None]) * size[:, None]
-        return FreeMotion(rest, (self.start - offset) / scale, self.spacing / scale, tones, self.camera)
+        return FreeMotion(
+            self.coefficients + moved[..., None],
+            (self.start - offset) / scale,
+            self.spacing / scale,
+            tones,
+            self.camera,
+        )
 
     def within(self, first: float, last: float) -> "FreeMotion":
         """The motion between two times in seconds, without the knots that have no influence there.

@@ -8,16 +8,14 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
 import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from rsvib_torch.checks.validation import Positive, options, validate
+from rsvib_torch.checks.validation import Positive, options
 from rsvib_torch.checks.values import check_choice, check_number, check_whole_number, described
-from rsvib_torch.files.reading import Table, read_toml
+from rsvib_torch.files.reading import Table
 
 if TYPE_CHECKING:
     import torch
@@ -158,49 +156,6 @@ class SensorTiming:
         period = 1 / check_number("frame_rate", frame_rate, above=0.0)
         others = scan_axis, readout_direction, frame_start_times, row_time_std
         return cls(row_time, exposure / row_time, period / row_time, *others)
-
-    @staticmethod
-    def from_file(path: str | os.PathLike[str]) -> SensorTiming:
-        """The timing in the table ``[sensor]`` of a configuration file, as ``rsvib init`` writes it.
-
-        Raises:
-            ValueError: If it is not TOML, or a key of ``[sensor]`` is missing, unknown or has a wrong type or value.
-
-        Example:
-            >>> SensorTiming.from_file("camera.toml").frame_rate  # doctest: +SKIP
-            29.97
-        """
-        data = read_toml(Path(path))
-        stated = {name: table for name, table in data.items() if name == "sensor"}
-        section: SensorSection = validate(_SensorFile, stated, str(path)).sensor
-        return section.to_timing()
-
-    @classmethod
-    def line_sensors(
-        cls, line_time: float, delays: Sequence[float], num_lines: int, exposure_lines: float = 1.0
-    ) -> SensorTiming:
-        """Timing of images of the same ground from several lines (or bands) of a push-broom sensor.
-
-        Each line records the same ground line by line after its own delay. Registered to the ground, the images are
-        frames of a rolling shutter whose exposures start after these delays: the jitter of the platform is estimated
-        from parallax pairs, except at frequencies that are multiples of one over all delays.
-
-        Args:
-            line_time: Time between lines, in seconds.
-            delays: Delay in s of the recording of the ground by each line, increasing; 0 for the first.
-            num_lines: Number of lines of the images.
-            exposure_lines: Exposure in line times, including the stages of time-delayed integration.
-
-        Example:
-            >>> pair = SensorTiming.line_sensors(line_time=1e-4, delays=[0.0, 0.04], num_lines=5000)
-            >>> pair.frame_starts(2).tolist()
-            [0.0, 0.04]
-        """
-        lines = check_whole_number("num_lines", num_lines, at_least=1)
-        check_number("exposure_lines", exposure_lines, above=0.0)
-        if not isinstance(delays, Sequence) or len(delays) < 2:
-            raise ValueError(f"delays must have at least two entries, got {described(delays)}")
-        return cls(line_time, exposure_lines, max(lines, exposure_lines), frame_start_times=tuple(delays))
 
     @property
     def exposure_time(self) -> float:
@@ -387,11 +342,6 @@ def _in_rows(name: str, value: float | None, converted: float | None, rows_name:
             "remove one of the two keys"
         )
     return rows
-
-
-@options
-class _SensorFile:
-    sensor: SensorSection
 
 
 @dataclass(frozen=True)

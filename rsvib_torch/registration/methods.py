@@ -1,7 +1,15 @@
-"""The methods of band registration: cross-correlation, phase correlation and gray projection."""
+"""Band registration: the task, windows of rows, peaks of correlation surfaces, and the methods.
+
+The methods are cross-correlation, phase correlation and gray projection. Images have rows on axis -2 in readout order.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -9,23 +17,158 @@ from torch.nn import functional
 from rsvib_torch.execution.chunking import chunks
 from rsvib_torch.execution.parallel import in_parallel
 from rsvib_torch.numerics.fourier import fast_length
-from rsvib_torch.registration.bands import (
-    BINNING,
-    LAGS,
-    BandTask,
-    cut_lags,
-    fine_offsets,
-    integer_peak,
-    subpixel_peak,
-    take_windows,
-    whole_pixel_peak,
-)
+from rsvib_torch.numerics.tables import Array, table, tensor
 
-# Zero-mean normalised cross-correlation (NCC)
+BINNING = 4  # columns that are averaged in the search for whole pixels; a parabola recovers the single pixel
+LAGS = 4  # px, reach of a fine correlation surface to either side: 9 samples fix the peak to 0.001 px (subpixel_peak)
 
 
-def register_ncc(task: BandTask) -> tuple[Tensor, Tensor]:
-    """Offsets and quality of bands: a search for whole pixels in binned columns, then the peak at full resolution."""
+def template_margin(search: int) -> int:
+    """Columns kept free on either side of a template, so that no lag of a search range in px leaves the frame."""
+    return search + LAGS + BINNING
+
+
+@dataclass(frozen=True, eq=False)
+class BandTask:
+    """Bands of frame pairs to be registered."""
+
+    first: Tensor  # (L, H, W) earlier frames, float32 or float64, of about zero mean
+    second: Tensor  # (L, H, W) later frames
+    coarse: Tensor  # (L, 2) int64 px, whole-frame offsets, axes (x, y)
+    tops: Tensor  # (N,) int64, first row of each band in the earlier frame
+    height: int  # rows of a band
+    search: int  # search range in px around the coarse offset
+
+    @property
+    def width(self) -> int:
+        """Columns of the templates: the overlap of every pair less the margins."""
+        return self.first.shape[-1] - int(self.coarse[:, 0].abs().amax()) - 2 * template_margin(self.search)
+
+    @property
+    def left(self) -> Tensor:
+        """First column of the templates of each pair, (L,)."""
+        return (-self.coarse[:, 0]).clamp(min=0) + template_margin(self.search)
+
+    @property
+    def places(self) -> Tensor:
+        """Column and row of the first pixel of each template, (L, N, 2)."""
+        shape = (len(self.coarse), len(self.tops))
+        return torch.stack([self.left[:, None].expand(shape), self.tops.expand(shape)], dim=-1)
+
+    @property
+    def start(self) -> Tensor:
+        """Whole-pixel shifts (L, N, 2) at which the search starts: the whole-frame offset for every band."""
+        return self.coarse[:, None].expand(-1, len(self.tops), -1)
+
+
+def take_windows(images: Tensor, tops: Tensor, lefts: Tensor, height: int, width: int) -> Tensor:
+    """Windows (L, N, height, width) of images (L, H, W) at rows and columns (L, N); beyond the edge, rows repeat."""
+    batch, num_rows, num_columns = images.shape
+    rows = (tops[..., None] + torch.arange(height, device=images.device)).clamp(0, num_rows - 1)
+    lefts = lefts.clamp(0, num_columns - width)
+    start = torch.arange(batch, device=images.device)[:, None, None] * num_rows + rows
+    flat = images.reshape(-1).unfold(0, width, 1)  # a view: entry i holds pixels i to i + width - 1
+    return flat[start * num_columns + lefts[..., None]]
+
+
+def integer_peak(surface: Tensor) -> tuple[Tensor, Tensor]:
+    """Indices (M, 2) as (row, column) of the largest entry of each surface (M, A, B), and its value (M,)."""
+    value, flat = surface.flatten(-2).max(-1)
+    return torch.stack([flat // surface.shape[-1], flat % surface.shape[-1]], dim=-1), value
+
+
+def cut_lags(surface: Tensor, place: Tensor, reach: tuple[int, int]) -> Tensor:
+    """The part of each surface (M, A, B) around ``place`` (M, 2), 2 reach + 1 lags per axis; edges repeat."""
+    rows = place[:, :1] + torch.arange(-reach[0], reach[0] + 1, device=surface.device)
+    columns = place[:, 1:] + torch.arange(-reach[1], reach[1] + 1, device=surface.device)
+    rows, columns = rows.clamp(0, surface.shape[-2] - 1), columns.clamp(0, surface.shape[-1] - 1)
+    part = surface.gather(1, rows[..., None].expand(-1, -1, surface.shape[-1]))
+    return part.gather(2, columns[:, None].expand(-1, rows.shape[1], -1))
+
+
+def _at_edge(place: Tensor, surface: Tensor) -> Tensor:
+    """(M,) bool: whether a peak lies at the edge of its surface (M, A, B)."""
+    last = torch.tensor(surface.shape[-2:], device=place.device) - 1
+    return ((place == 0) | (place == last)).any(-1)
+
+
+def whole_pixel_peak(surface: Tensor, factor: int) -> tuple[Tensor, Tensor]:
+    """Whole-pixel lags (L, N, 2) in (x, y) of the peaks of surfaces (L, N, A, B), and whether they are inside (L, N).
+
+    The columns count ``factor`` pixels each; a parabola through three columns gives the single pixel.
+    """
+    flat = surface.flatten(0, 1)
+    place, value = integer_peak(flat)
+    around = cut_lags(flat, place, (0, 1))[:, 0]
+    bend = around[:, 2] - 2 * around[:, 1] + around[:, 0]
+    fraction = torch.where(bend < 0, 0.5 * (around[:, 0] - around[:, 2]) / bend.clamp(max=-1e-12), 0.0)
+    x = ((place[:, 1] - flat.shape[-1] // 2 + fraction.clamp(-0.5, 0.5)) * factor).round().long()
+    y = place[:, 0] - flat.shape[-2] // 2
+    inside = ~_at_edge(place, flat) & (value > 0)
+    return torch.stack([x, y], -1).unflatten(0, surface.shape[:2]), inside.unflatten(0, surface.shape[:2])
+
+
+def fine_offsets(task: BandTask, shift: Tensor, surface: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+    """Offsets (L, N, 2) and quality (L, N) of ``valid`` bands from surfaces of the lags within LAGS around shifts."""
+    flat = surface.flatten(0, 1)
+    place, _ = integer_peak(flat)
+    # the peak comes to the centre, so that it has neighbours on every side to interpolate from
+    position, value = subpixel_peak(cut_lags(flat, place, (LAGS - 1, LAGS - 1)))
+    fine = (position + place - LAGS).flip(-1).unflatten(0, valid.shape)
+    offsets = shift + fine
+    good = valid & ~_at_edge(place, flat).unflatten(0, valid.shape) & torch.isfinite(fine).all(-1)
+    good = good & ((offsets - task.start).abs() < task.search).all(-1)
+    quality = torch.where(good, value.unflatten(0, valid.shape).clamp(0.0, 1.0), 0.0)
+    return torch.where(good[..., None], offsets, torch.nan), quality
+
+
+@cache
+def _polynomials(size: int) -> Array:
+    """Matrices (3, size, size) from samples around 0 to a polynomial and its first and second derivatives."""
+    matrices = [np.linalg.inv(np.vander(np.arange(size) - size // 2.0, increasing=True))]
+    for _ in range(2):
+        matrices.append(np.roll(np.arange(size)[:, None] * matrices[-1], -1, 0))
+    return np.stack(matrices)
+
+
+@np.errstate(divide="ignore", invalid="ignore")
+def subpixel_peak(surface: Tensor) -> tuple[Tensor, Tensor]:
+    """Maximum of the polynomial through all samples of surfaces (M, A, B), by Newton's method from the centre.
+
+    The correlation of band-limited images is band limited, so that its samples at whole pixels determine it. For images
+    smoothed by a Gaussian of 1 px, the polynomial through 9 samples per axis errs by less than 0.001 px, a three-point
+    parabola by 0.05 px. A and B are odd, the integer peak is at the centre. The
+    result is the position (M, 2) as (row, column) relative to the centre, NaN where no maximum lies within one pixel of
+    it, and the value there (M,); float64.
+    """
+    samples = table(surface).astype(np.float64)
+    count, rows, columns = samples.shape
+    position, converging = np.zeros((count, 2)), np.ones(count, dtype=bool)
+    for _ in range(5):  # Newton's method doubles the digits: 5 steps from within half a pixel reach 1e-9 px
+        # 1. The value, and its derivatives by the row (down) and by the column (right) up to the second order.
+        across, along = (
+            (np.vander(place, size, increasing=True) @ _polynomials(size)).swapaxes(0, 1)
+            for place, size in zip(position.T, (rows, columns), strict=True)
+        )
+        derivatives = (across @ samples @ along.mT).reshape(count, 9).T
+        value, right, by_columns, down, mixed, _, by_rows = derivatives[:7]
+        # 2. A step to the maximum, where there is one.
+        determinant = by_rows * by_columns - np.square(mixed)
+        converging = converging & (determinant > 0) & (by_rows < 0)
+        move = np.stack([mixed * right - by_columns * down, mixed * down - by_rows * right], -1)
+        step = np.clip(move / determinant[:, None], -0.5, 0.5)
+        position = np.where(converging[:, None], position + step, position)
+    converging = converging & (np.abs(position) <= 1.0).all(-1)
+    position[~converging] = np.nan
+    peaks = tensor(np.column_stack([position, value])).to(surface.device)
+    return peaks[:, :2], peaks[:, 2]
+
+
+def _whole_pixels(task: BandTask) -> tuple[Tensor, Tensor]:
+    """Whole-pixel shifts (L, N, 2) of bands by cross-correlation of binned columns, and whether they are known (L, N).
+
+    All methods begin with it: the profiles of a band are too short for the search range across the rows.
+    """
     factor = next((factor for factor in (BINNING, BINNING // 2) if task.width // factor >= 64), 1)
     reach, width, height = -(-task.search // factor), task.width // factor, task.first.shape[-2]
 
@@ -36,13 +179,21 @@ def register_ncc(task: BandTask) -> tuple[Tensor, Tensor]:
     first = binned(task.first, task.left[:, None], width)
     left = (task.left + task.coarse[:, 0])[:, None] - reach * factor
     second = binned(task.second, left, width + 2 * reach)
-    places, rows = task.places, task.places[..., 1]
+    rows = task.places[..., 1]
     of_first = torch.stack([torch.zeros_like(rows), rows], -1)
     of_second = torch.stack([torch.full_like(rows, reach), rows + task.coarse[:, None, 1]], -1)
     surface = _correlate_bands(first, second, of_first, of_second, (task.height, width), (task.search, reach))
     lag, inside = whole_pixel_peak(surface, factor)
-    shift = task.start + lag
-    moved = places + shift
+    return task.start + lag, inside
+
+
+# Zero-mean normalised cross-correlation (NCC)
+
+
+def register_ncc(task: BandTask) -> tuple[Tensor, Tensor]:
+    """Offsets and quality of bands by the peak of their cross-correlation."""
+    shift, inside = _whole_pixels(task)
+    places, moved = task.places, task.places + shift
     surface = _correlate_bands(task.first, task.second, places, moved, (task.height, task.width), (LAGS, LAGS))
     inside &= (moved[..., 1] >= LAGS) & (moved[..., 1] + task.height + LAGS <= task.first.shape[-2])
     return fine_offsets(task, shift, surface, inside)
@@ -114,11 +265,11 @@ def _window_sums(
     first = torch.stack([inner.sum(-1), torch.linalg.vecdot(inner, inner)], 1).double()[..., None]
     change = torch.stack([right - left, right.square() - left.square()], 1)
     runs = torch.cat([first, first + change.cumsum(-1, dtype=torch.float64)], -1)  # (L, 2, H, extra + 1)
-    table = functional.pad(runs.cumsum(2), (0, 0, 1, 0)).flatten(2)
+    sums_table = functional.pad(runs.cumsum(2), (0, 0, 1, 0)).flatten(2)
     step = extra + 1
     index = (rows * step)[..., :, None] + columns[..., None, :]  # (L, N, lags_y, lags_x)
     flat = index.flatten(1)[:, None].expand(-1, 2, -1)
-    sums = (table.gather(2, flat + height * step) - table.gather(2, flat)).unflatten(2, index.shape[1:])
+    sums = (sums_table.gather(2, flat + height * step) - sums_table.gather(2, flat)).unflatten(2, index.shape[1:])
     total, energy = torch.where(inside[:, None], sums, torch.nan).unbind(1)
     return total, energy
 
@@ -132,26 +283,15 @@ def register_phase(task: BandTask) -> tuple[Tensor, Tensor]:
     The cross-power spectrum is whitened where it exceeds the noise, and low-passed, so that samples at whole pixels
     determine its peak.
     """
-    places = task.places
-    num_rows = task.first.shape[-2]
-    # search for whole pixels: these windows contain the band's content at every lag of the search range
-    tall, factor = task.height + 2 * task.search, BINNING
-    width = task.width // factor * factor
-    up = torch.tensor([0, task.search], device=places.device)
-    pair = [
-        take_windows(image, place[..., 1], place[..., 0], tall, width).unflatten(-1, (-1, factor)).mean(-1)
-        for image, place in ((task.first, places - up), (task.second, places + task.start - up))
-    ]
-    still = torch.zeros_like(task.start, dtype=task.first.dtype)
-    surface = _phase_surface(pair[0], pair[1], still, (task.search, -(-task.search // factor) + 1), (1.0, 1.0 * factor))
-    lag, valid = whole_pixel_peak(surface, factor)
-    shift, fraction = task.start + lag, still
+    places, num_rows = task.places, task.first.shape[-2]
+    shift, valid = _whole_pixels(task)
+    fraction = torch.zeros_like(shift, dtype=task.first.dtype)
     template = take_windows(task.first, places[..., 1], places[..., 0], task.height, task.width)
     for _ in range(2):  # the window follows the content: to a whole pixel, then to a fraction
         moved = places + shift
         inside = (moved[..., 1] >= 0) & (moved[..., 1] + task.height <= num_rows)
         window = take_windows(task.second, moved[..., 1], moved[..., 0], task.height, task.width)
-        surface = _phase_surface(template, window, fraction, (LAGS, LAGS), (1.0, 1.0))
+        surface = _phase_surface(template, window, fraction)
         offsets, quality = fine_offsets(task, shift, surface, valid & inside)
         best = torch.where(torch.isfinite(offsets), offsets, shift.to(offsets.dtype))
         shift = best.round().long()
@@ -165,12 +305,10 @@ def _hann(size: int, shift: Tensor) -> Tensor:
     return torch.sin(torch.pi * places.clamp(0, size + 1) / (size + 1)).square()
 
 
-def _phase_surface(
-    first: Tensor, second: Tensor, fraction: Tensor, reach: tuple[int, int], pixel: tuple[float, float]
-) -> Tensor:
-    """Phase correlation of windows (L, N, h, w) at the lags -reach ... reach: (L, N, lags_y, lags_x).
+def _phase_surface(first: Tensor, second: Tensor, fraction: Tensor) -> Tensor:
+    """Phase correlation of windows (L, N, h, w) at the lags -LAGS ... LAGS: (L, N, lags_y, lags_x).
 
-    ``fraction`` (L, N, 2) is the shift of the Hann window of the second, ``pixel`` the size (y, x) of pixels, in px.
+    ``fraction`` (L, N, 2) is the shift of the Hann window of the second in px.
     """
     shape = first.shape[:2]
     first, second, fraction = first.flatten(0, 1), second.flatten(0, 1), fraction.flatten(0, 1)
@@ -186,18 +324,15 @@ def _phase_surface(
     u = torch.fft.rfftfreq(width, dtype=first.dtype, device=first.device)
     high = (u > 0.4)[None] & (v.abs() > 0.25)[:, None]  # cycles/px: noise only, after the Gaussian of 1 px
     noise = (magnitude * high).sum((-2, -1), keepdim=True) / high.sum()
-    low_pass = torch.exp(-((v[:, None] / pixel[0]).square() + (u / pixel[1]).square()) / (2 * 0.15**2))
+    low_pass = torch.exp(-(v[:, None].square() + u.square()) / (2 * 0.15**2))
     twice = torch.full_like(u, 2.0)  # rfft stores one half of the spectrum
     twice[0] = 1.0
     if width % 2 == 0:
         twice[-1] = 1.0
     weight = low_pass * twice / (magnitude + 10.0 * noise + torch.finfo(first.dtype).tiny)
     full = (magnitude * weight).sum((-2, -1))
-    transforms = []
-    for size, frequency in zip(reach, (v, u), strict=True):
-        lags = torch.arange(-size, size + 1, dtype=frequency.dtype, device=first.device)
-        angle = 2 * torch.pi * lags[:, None] * frequency
-        transforms.append(torch.polar(torch.ones_like(angle), angle))
+    lags = torch.arange(-LAGS, LAGS + 1, dtype=first.dtype, device=first.device)
+    transforms = [torch.exp(2j * torch.pi * lags[:, None] * frequency) for frequency in (v, u)]
     surface = (transforms[0] @ ((cross * weight) @ transforms[1].T)).real
     return (surface / full.clamp(min=torch.finfo(first.dtype).tiny)[:, None, None]).unflatten(0, shape)
 
@@ -208,91 +343,28 @@ def _phase_surface(
 def register_projection(task: BandTask) -> tuple[Tensor, Tensor]:
     """Offsets and quality of bands by correlation of profiles, the means of rows and of columns.
 
-    Across the rows, the profile of a band is too short for the search range. Windows that are eight search ranges tall
-    therefore give a smooth course of the offset first. With that shift, the bands give the offset along
-    the rows, and with both shifts the remaining offset across the rows.
+    The sum of the correlations along both axes has its peak where each of them has its own.
     """
-    places = task.places
-    course = _smooth_course(_search_rows(task)).round().long()
-    shift = task.start + torch.stack([torch.zeros_like(course), course], dim=-1)
-    # peaks near the edge of the search range are interpolated from lags beyond it
-    x, quality_x = _band_profiles(task, places, shift, (0, task.search + LAGS - 1))
-    shift[..., 0] += torch.nan_to_num(x).round().long()
-    y, quality_y = _band_profiles(task, places, shift, (2 * LAGS, 0))
-    offsets = torch.stack([task.start[..., 0] + x, shift[..., 1] + y], dim=-1)
-    good = torch.isfinite(offsets).all(-1) & ((offsets - task.start).abs() < task.search).all(-1)
-    return torch.where(good[..., None], offsets, torch.nan), torch.where(good, torch.minimum(quality_x, quality_y), 0.0)
+    shift, valid = _whole_pixels(task)
+    down, along = (_profile_correlation(task, shift, reach) for reach in ((LAGS, 0), (0, LAGS)))
+    top = task.places[..., 1] + shift[..., 1]
+    valid &= (top >= LAGS) & (top + task.height + LAGS <= task.first.shape[-2])
+    valid &= torch.minimum(down.amax(-1), along.amax(-1)) > 0.6  # profiles of a few dozen rows reach 0.6 by chance
+    return fine_offsets(task, shift, 0.5 * (down[..., :, None] + along[..., None, :]), valid)
 
 
-def _search_rows(task: BandTask) -> Tensor:
-    """Offsets across the rows (L, N) beyond the coarse one, from tall windows; NaN where there is no peak."""
-    num_rows = task.first.shape[-2]
-    tall = min(max(task.height, 8 * task.search), num_rows // 2)
-    tops = (task.tops + (task.height - tall) // 2).clamp(0, num_rows - tall)
-    reach = task.search + LAGS - 1
-    lefts = task.left[:, None], (task.left + task.coarse[:, 0])[:, None]
-    windows = [
-        take_windows(image, torch.zeros_like(left), left, num_rows, task.width)[:, 0]
-        for image, left in zip((task.first, task.second), lefts, strict=True)
-    ]
-    row_means = [functional.pad(_differences(window.mean(-1)), (1, 1)) for window in windows]
-    begin = tops + task.coarse[:, 1:] - reach
-    later = take_windows(row_means[1][..., None], begin, torch.zeros_like(begin), tall + 2 * reach, 1)[..., 0]
-    template = row_means[0][:, tops[:, None] + torch.arange(tall, device=begin.device)]
-    surface = _correlate_profiles(template, later)
-    lag_begin = begin[..., None] + torch.arange(2 * reach + 1, device=begin.device)
-    return _profile_peak(torch.where((lag_begin >= 0) & (lag_begin + tall <= num_rows), surface, -torch.inf))[0]
-
-
-def _smooth_course(course: Tensor) -> Tensor:
-    """Course (L, N) with gaps filled from the nearest band and outliers removed by a median over 5 bands."""
-    count = course.shape[-1]
-    order = torch.arange(count, device=course.device)
-    valid = torch.isfinite(course)
-    before = torch.where(valid, order, -1).cummax(-1).values
-    after = torch.where(valid, order, count).flip(-1).cummin(-1).values.flip(-1)
-    nearest = torch.where((before < 0) | ((after < count) & (after - order < order - before)), after, before)
-    filled = torch.nan_to_num(course.gather(-1, nearest.clamp(0, count - 1)))
-    padded = functional.pad(filled[:, None], (2, 2), mode="replicate")[:, 0]
-    return padded.unfold(-1, 5, 1).median(-1).values
-
-
-def _band_profiles(task: BandTask, places: Tensor, shift: Tensor, reach: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Offset of bands beyond ``shift`` along the axis whose ``reach`` (rows, columns) is not 0, (L, N), and quality."""
-    summed, moved, height, width = (-1 if reach[0] else -2), places + shift, task.height, task.width
+def _profile_correlation(task: BandTask, shift: Tensor, reach: tuple[int, int]) -> Tensor:
+    """Correlation (L, N, 2 LAGS + 1) of profiles at lags around ``shift`` along the axis whose ``reach`` is not 0."""
+    summed, places, height, width = (-1 if reach[0] else -2), task.places, task.height, task.width
+    left, top = (places + shift).unbind(-1)
     first = take_windows(task.first, places[..., 1], places[..., 0], height, width)
-    top, left = moved[..., 1] - reach[0], moved[..., 0] - reach[1]
-    second = take_windows(task.second, top, left, height + 2 * reach[0], width + 2 * reach[1])
-    surface = _correlate_profiles(_differences(first.mean(summed)), _differences(second.mean(summed)))
-    lags = torch.arange(-reach[0], reach[0] + 1, device=surface.device)
-    begin = moved[..., 1, None] + lags
-    inside = (begin >= 0) & (begin + task.height <= task.second.shape[-2])
-    offset, quality = _profile_peak(torch.where(inside, surface, -torch.inf))
-    significant = quality > 0.6  # profiles of a few dozen rows reach 0.6 by chance
-    return torch.where(significant, offset, torch.nan), torch.where(significant, quality, 0.0)
+    second = take_windows(task.second, top - reach[0], left - reach[1], height + 2 * reach[0], width + 2 * reach[1])
+    return _correlate_profiles(_differences(first.mean(summed)), _differences(second.mean(summed)))
 
 
 def _differences(profile: Tensor) -> Tensor:
     """Central differences without the ends, which suppress slow changes of brightness."""
     return profile[..., 2:] - profile[..., :-2]
-
-
-def _profile_peak(surface: Tensor) -> tuple[Tensor, Tensor]:
-    """Sub-pixel lag of the peaks of correlations (L, N, 2 reach + 1), NaN where there is none, and quality.
-
-    -infinity marks lags that leave the frame. A peak next to one, or at the edge of the search range of ``reach - LAGS
-    + 1``, is none.
-    """
-    flat = surface.flatten(0, 1)[..., None]
-    place, _ = integer_peak(flat)
-    around = cut_lags(flat, place, (LAGS - 1, 0))
-    whole = torch.isfinite(around).all(1)[:, 0]
-    position, value = subpixel_peak(torch.where(whole[:, None, None], around, 0.0))
-    lag = (place + position)[:, 0] - flat.shape[1] // 2
-    search = flat.shape[1] // 2 - LAGS + 1
-    good = whole & (lag.abs() < search) & torch.isfinite(lag)
-    lag, value = torch.where(good, lag, torch.nan), torch.where(good, value.clamp(0.0, 1.0), 0.0)
-    return lag.unflatten(0, surface.shape[:2]), value.unflatten(0, surface.shape[:2])
 
 
 def _correlate_profiles(template: Tensor, search: Tensor) -> Tensor:

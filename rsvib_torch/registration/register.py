@@ -27,8 +27,7 @@ from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.numerics.fourier import fast_length
 from rsvib_torch.options import BandRegistrationOptions, RegistrationOptions
-from rsvib_torch.registration.bands import BandTask, template_margin
-from rsvib_torch.registration.methods import BAND_METHODS
+from rsvib_torch.registration.methods import BAND_METHODS, BandTask, template_margin
 from rsvib_torch.results.presentation import Result
 
 # Correlation of bands of independent noise times the root of their pixels: medians of 12.6 (32 x 128 px), 10.4 (32 x

@@ -38,7 +38,6 @@ from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.restoration import RestorationMtf, RestorationVerdict
 from rsvib_torch.results.presentation import AXIS_NAMES, AXIS_UNITS, FIGURES
 from rsvib_torch.results.result_files import figure_png
-from rsvib_torch.row_time import RowTimeCalibration
 from rsvib_torch.stacks import StackManifest
 from rsvib_torch.text import measured_text
 
@@ -527,20 +526,6 @@ def _measured_offsets_figure(curve: OffsetCurve) -> Figure:
     return figure
 
 
-def _calibration_figure(result: RowTimeCalibration) -> Figure:
-    """Draw the light of the rows of up to four frames, and the bands that were fitted to it."""
-    if result.light is None or result.fitted_light is None:
-        raise ValueError("a calibration by motion has no figure; that of a flickering light has")
-    shown = min(4, len(result.light))
-    figure, panels = _panels(8, 0.9 + 1.7 * shown, shown, sharex=True, sharey=True)
-    for frame, panel in enumerate(panels[:, 0]):
-        panel.plot(result.light[frame], ".", color=_GREY, markersize=2.5, label="measured rows")
-        panel.plot(result.fitted_light[frame], color=_FIT_COLOUR, linewidth=1.3, label="fitted bands")
-        plain_axes(panel, "row" if frame == shown - 1 else "", "light / mean", title=f"frame {frame}")
-    panels[0, 0].legend(**_LEGEND_ABOVE, ncols=2)
-    return figure
-
-
 _BLIND_COLOUR = "#ececec"
 _LABELLED_LINES = 6  # per axis; more labels would cover each other
 
@@ -587,13 +572,6 @@ def _spectrum_figure(result: detection.DisplacementSpectrum) -> Figure:
     return figure
 
 
-def _check_figure(result: gyroscope.MotionCheck) -> Figure:
-    """Draw the offsets of row bands of each axis, before and after a motion is subtracted."""
-    before = [f"offsets {measured_text(rms, digits=3)} px rms" for rms in result.before]
-    after = [f"without the motion {measured_text(rms, digits=3)} px rms" for rms in result.after]
-    return _offsets_figure(result.times, ((before, result.offsets, _GREY), (after, result.residual, None)))
-
-
 def _rotation_figure(result: gyroscope.RotationAlignment) -> Figure:
     """Draw X, Y and roll from frame to frame, measured in the images and by the gyroscope, and their differences."""
     figure, panels = _panels(8, 7.2, 3, sharex=True)
@@ -621,10 +599,8 @@ FIGURES.update(
         ),
         (detection.DisplacementSpectrum, 0): _spectrum_figure,
         (detection.MotionDetection, 0): _detected_motion_figure,
-        (RowTimeCalibration, 0): _calibration_figure,
         (gyroscope.ClockAlignment, 0): lambda result: motion_figure(result.motion),
         (gyroscope.RotationAlignment, 0): _rotation_figure,
-        (gyroscope.MotionCheck, 0): _check_figure,
         (Vibration, 0): motion_figure,
         (FreeMotion, 0): motion_figure,
         (MtfCurve, 0): lambda curve: mtf_figure(

@@ -404,21 +404,6 @@ _RECORDED = {
         compares="duration of the readout, above the shortest interval between frames",
         unit="s",
     ),
-    "motion_enlarges_offsets": _px(
-        "rows are further apart without the motion: {value:.3g} px instead of {moved:.3g} px, at most {limit:.3g} px",
-        compares="offsets of the rows without the motion, above those with it by 0.05 px",
-        refuses="the motion, if it does not reduce the offsets of both axes together",
-    ),
-    "motion_leaves_offsets": _px(
-        "the motion leaves {value:.3g} px of the {moved:.3g} px that rows move, {limit:.3g} px are allowed",
-        compares="offsets of the rows without the motion, above half of those with it and 0.05 px",
-        refuses="the motion, if it does not reduce the offsets of both axes together",
-    ),
-    "offsets_not_reduced": _px(
-        "the motion does not reduce the offsets of rows between frames: {value:.3g} px remain of {limit:.3g} px",
-        compares="offsets of both axes together without the motion, not below those with it",
-        refuses="the motion",
-    ),
 }
 _ROW_TIME = {
     "row_time_uncertain": _of_result(
@@ -496,7 +481,7 @@ GROUPS = {
     "Tones (`detect_vibration`)": _TONES,
     "A vibration that is followed (`follow_vibration`)": _FOLLOWED,
     "Other motions (`detect_motion`)": _SHAPES,
-    "Recorded motions (`align_motion`, `check_motion`)": _RECORDED,
+    "Recorded motions (`align_motion`)": _RECORDED,
     "Row time (`calibrate_row_time_by_motion`)": _ROW_TIME,
     "Restoration (`restore`, `judge_restoration`)": _RESTORATION,
     "Files of later versions": {"unspecified": ReasonKind("{text}")},

@@ -49,7 +49,7 @@ class RowTimeOptions(OffsetOptions):
     """Shortest and longest possible row time in s. By default the rows of a frame are read within a tenth to the whole
     of the frame period."""
     exposure_time: Positive | None = None
-    """Exposure in s. None to measure it from the blur, if possible; it hardly affects the row time."""
+    """Exposure in s, if known. It does not affect the row time, but long ones may be refused without it."""
     scan_axis: Literal[-2, -1, "y", "x"] = -2
     """Axis along which rows follow each other, as in ``SensorTiming``."""
     readout_direction: Literal["forward", "reverse"] | None = None
@@ -89,8 +89,8 @@ def calibrate_row_time_by_motion(frames: FramesOrFiles, options: RowTimeOptions)
         options: Options; tones of more than ``0.5 / band_step`` cycles per row are not found.
 
     Returns:
-        Row time with its standard deviation, readout direction, and the exposure where it is known. ``reliable`` is
-        False, with ``findings``, if the row time is not determined; it is None if nothing is known about it.
+        Row time with its standard deviation, and readout direction. ``reliable`` is False, with ``findings``, if the
+        row time is not determined; it is None if nothing is known about it.
 
     Raises:
         ValueError: If frames cannot be registered, or an option is out of range.
@@ -127,8 +127,6 @@ def calibrate_row_time_by_motion(frames: FramesOrFiles, options: RowTimeOptions)
             f"row times of {1e6 * low:.3f} to {1e6 * high:.3f} us were considered, a readout within a tenth to the "
             "whole of the frame period; pass row_time=(low, high) for other ones"
         )
-    if exposure is not None:
-        notes.append("the exposure time is the given one")
     if num_frames < _MIN_FRAMES:
         found = _undetermined(Reason("too_few_frames_for_row_time", None, num_frames, _MIN_FRAMES))
     else:
@@ -173,11 +171,6 @@ def _result(found: RowTimeFit, clock: CameraClock, notes: list[str]) -> RowTimeC
         findings.append(Reason("row_times_ambiguous", None, len(found.others) + 1, 1, details))
     if known and found.std > found.permitted * abs(found.row_time):
         findings.append(Reason("row_time_uncertain", None, found.std / abs(found.row_time), found.permitted))
-    exposure, exposure_std = (found.exposure_time, found.exposure_std) if known else (None, None)
-    if clock.exposure_time is not None:
-        exposure, exposure_std = clock.exposure_time, 0.0
-    elif exposure is None and known:
-        notes = [*notes, "exposure unknown: the blur hardly differs between the frames"]
     directions: tuple[Literal["forward", "reverse"], ...] = ("forward", "reverse")
     signs = {one.row_time > 0 for one in found.others} | {found.row_time > 0}
     return RowTimeCalibration(
@@ -185,8 +178,6 @@ def _result(found: RowTimeFit, clock: CameraClock, notes: list[str]) -> RowTimeC
         row_time_std=found.std if known else None,
         frame_rows=clock.period / abs(found.row_time) if known else None,
         readout_direction=directions[found.row_time < 0] if known and len(signs) == 1 else None,
-        exposure_time=exposure,
-        exposure_time_std=exposure_std,
         notes=tuple(notes),
         candidates=tuple(sorted((found.row_time, *(one.row_time for one in found.others)))) if known else (),
         reliable=not findings,

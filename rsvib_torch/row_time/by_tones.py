@@ -67,8 +67,6 @@ class RowTimeFit:
     row_time: float  # seconds, negative for a reverse readout
     std: float  # its standard deviation
     others: tuple[Candidate, ...] = ()  # other row times that explain the frames as well
-    exposure_time: float | None = None  # in s, measured from the blur; None if it was not
-    exposure_std: float | None = None  # its standard deviation
     findings: tuple[Reason, ...] = ()  # reasons why the row time is not certain
     # largest standard deviation over the row time of a certain result; frequencies have the same relative error
     permitted: float = 0.01
@@ -253,11 +251,10 @@ class CameraClock:
     directions: tuple[float, ...]  # possible readout directions: 1.0 forward, -1.0 reverse
     exposure_time: float | None  # in s; None if unknown
 
-    def timing(self, row_time: float, exposure_time: float | None = None) -> RowTiming:
+    def timing(self, row_time: float) -> RowTiming:
         """Timing in row order with a row time, whose sign is its direction."""
         size = abs(row_time)
-        exposure = exposure_time or self.exposure_time or size
-        return RowTiming(size, exposure / size, max(self.period / size, self.num_rows))
+        return RowTiming(size, (self.exposure_time or size) / size, max(self.period / size, self.num_rows))
 
     def near(self, fit: RowTimeFit) -> "CameraClock":
         """The clock with the row times that a fit allows only."""
@@ -386,7 +383,6 @@ def _measured_with(
     curve = band_curve(stack.images, stack.valid, timing, options, mere_start=True)
     start, _ = robust_fit(measurements_of_curve(curve, timing, options.band_step), frequencies, active, MotionModel())
     intervals, device = compared_intervals(timing, stack.images.shape[1]), stack.images.device
-    exposure = None
     for _ in range(4):
         rows = grouped_frames(stack.images, stack.valid, timing, motion_of_fit(shrunk(start, intervals), device))
         found = refine(rows, intervals, start, None)
@@ -396,15 +392,12 @@ def _measured_with(
         previous = size
         size, std, start = _fit_row_time(places, size, found.fit)
         size = min(max(size, 0.5 * clock.low), clock.period / clock.num_rows)
-        if clock.exposure_time is None:
-            exposure = _exposure(found.other_motion, timing)
-        timing = clock.timing(size, None if exposure is None else exposure[0])
+        timing = clock.timing(size)
         if abs(size - previous) < 0.3 * std:
             break
     found_tones = [_row_tones(places, start, axis, size, clock) for axis in range(2)]
     against = _findings(places.timed(size), start, found.other_motion)
-    exposure_time, exposure_std = exposure or (None, None)
-    return RowTimeFit(direction * size, std, (), exposure_time, exposure_std, against), found_tones
+    return RowTimeFit(direction * size, std, findings=against), found_tones
 
 
 def _fit_row_time(places: FramePlaces, row_time: float, fit: ToneFit) -> tuple[float, float, ToneFit]:
@@ -445,14 +438,3 @@ def _row_tones(places: FramePlaces, fit: ToneFit, axis: int, row_time: float, cl
     tones = np.stack([turned.real, turned.imag, frequencies * row_time, frequencies * clock.period], -1)
     start = np.concatenate([tones.ravel(), fit.drift[0, axis, :1] * clock.period])
     return fit_row_tones(centred, axis, start)
-
-
-def _exposure(other: OtherMotion, timing: RowTiming) -> tuple[float, float] | None:
-    """Exposure time in s and its standard deviation from the difference of the blur between frames; None if unknown."""
-    ratio, std, size = other.blur[0].tolist()
-    # interpolation errors change ratio * size by about 0.005, finite differences change the ratio by a fifth
-    uncertainty = math.hypot(std, 0.005 / max(size, 1e-12), 0.2 * ratio)
-    if ratio < 3 * uncertainty:
-        return None
-    exposure = min(timing.exposure_time * math.sqrt(ratio), timing.frame_period)
-    return exposure, 0.5 * exposure * uncertainty / ratio

@@ -1,26 +1,19 @@
-"""Row time, readout direction and exposure of a camera from frames of flickering light."""
+"""Row time of a camera from frames of flickering light."""
 
-import math
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
-import torch
-from pydantic import Field
-from torch import Tensor
 
 from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.arrays import Channels, FramesOrFiles
 from rsvib_torch.checks.validation import Positive
 from rsvib_torch.checks.values import check_number
-from rsvib_torch.numerics.tables import Array
 from rsvib_torch.results.presentation import JudgedResult
 from rsvib_torch.results.reason import Reason
-from rsvib_torch.row_time.flicker import MIN_PERIODS, BandFit, Profiles, find_bands, row_profiles
-from rsvib_torch.row_time.strobe import exposure_from_contrast, exposure_from_shape, fit_strobe
+from rsvib_torch.row_time.flicker import MIN_PERIODS, find_bands, row_profiles
 from rsvib_torch.text import measured_text, wrapped
 
-Gamma = Annotated[float, Field(gt=0, le=4)]
 ScanAxis = Literal[-2, -1, "y", "x"]
 
 
@@ -28,7 +21,7 @@ ScanAxis = Literal[-2, -1, "y", "x"]
 class RowTimeCalibration(
     JudgedResult,
     units={
-        **dict.fromkeys(("row_time", "row_time_std", "exposure_time", "exposure_time_std", "candidates"), "s"),
+        **dict.fromkeys(("row_time", "row_time_std", "candidates"), "s"),
         **{"period_rows": "rows", "flicker_frequency": "Hz", "frame_rows": "row times"},
     },
 ):
@@ -41,17 +34,12 @@ class RowTimeCalibration(
         contrast: Amplitude of the bands' fundamental over their mean, at most 2; None without flickering light.
         flicker_frequency: In Hz, as given or found; None without flickering light.
         frame_rows: Row times from one frame to the next, where the frame rate is known.
-        readout_direction: ``"forward"`` or ``"reverse"``, from bands that move between frames.
-        exposure_time: T_e in seconds.
-        exposure_time_std: Its standard deviation.
+        readout_direction: ``"forward"`` or ``"reverse"``, from the motion of the frames; None if it is unknown.
         notes: Reasons for undetermined values, and warnings.
         candidates: Row times in seconds that explain the motion of the frames, negative for a reverse readout; empty
             for a calibration with flickering light.
         reliable: Whether a single row time explains the frames.
         findings: Each ``Reason`` why not; ``reasons`` has their texts.
-        light: (T, H) light of the rows of each frame over its mean, without the brightness of the scene; None without
-            flickering light.
-        fitted_light: (T, H) the bands that were fitted to it.
     """
 
     row_time: float | None
@@ -61,14 +49,10 @@ class RowTimeCalibration(
     flicker_frequency: float | None = None
     frame_rows: float | None = None
     readout_direction: Literal["forward", "reverse"] | None = None
-    exposure_time: float | None = None
-    exposure_time_std: float | None = None
     notes: tuple[str, ...] = ()
     candidates: tuple[float, ...] = ()
     reliable: bool = True
     findings: tuple[Reason, ...] = ()
-    light: Tensor | None = None
-    fitted_light: Tensor | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -85,10 +69,6 @@ class RowTimeCalibration(
                 f"flicker {self.flicker_frequency:.6g} Hz",
                 f"bands of {self.period_rows:.3f} rows, contrast {self.contrast:.3g}",
             ]
-        if self.exposure_time is not None:
-            std = None if self.exposure_time_std is None else 1e6 * self.exposure_time_std
-            rows = "" if self.row_time is None else f", {self.exposure_time / self.row_time:.2f} row times"
-            lines.append(f"exposure {measured_text(1e6 * self.exposure_time, std or None)} us{rows}")
         if self.frame_rows is not None:
             lines.append(f"frame period {self.frame_rows:.2f} row times")
         if self.readout_direction is not None:
@@ -104,10 +84,7 @@ def calibrate_row_time(
     flicker_frequency: Positive,
     *,
     frame_rate: Positive | None = None,
-    on_fraction: Annotated[float, Field(gt=0, le=0.999)] | None = None,
-    light_contrast: Annotated[float, Field(gt=0, le=2)] | None = None,
     scan_axis: ScanAxis = -2,
-    gamma: Gamma = 1.0,
     full_scale: float | None = None,
     channels: Channels = None,
 ) -> RowTimeCalibration:
@@ -117,20 +94,14 @@ def calibrate_row_time(
     number of harmonics that maximises the evidence. Shading along the rows is part of the fit; several frames of a
     still scene whose bands lie at different rows eliminate its texture.
 
-    With a frame rate the bands' phase from frame to frame, ``f / frame_rate`` turns, determines the readout direction,
-    unless it is close to a whole or half number of turns. The exposure follows from the shape of the bands
-    of a light that is on for a known fraction of time, or from the contrast of the bands of a light whose own
-    contrast is known: ``sinc(f T_e)`` of it.
+    Bands do not show the readout direction: it is that of most cameras, ``"forward"``, unless detection names another
+    one, see ``detect_vibration``.
 
     Args:
         frames: (T, H, W) or (T, C, H, W); floats of full scale 1, integers, or files.
         flicker_frequency: f in Hz. Mains light flickers at twice the frequency of the mains.
         frame_rate: Frames per second, T >= 2 consecutive ones.
-        on_fraction: Fraction of time that an on-off light is on (0.5 for a square wave).
-        light_contrast: Amplitude over mean of the light's own fundamental, for a sinusoidal light.
         scan_axis: Axis along which rows follow each other, as in ``SensorTiming``.
-        gamma: Pixels are raised to this power to make them proportional to light (about 2.2 for photographs). The
-            row time does not depend on it, the exposure does.
         full_scale: Count that means 1.0, for integers other than 8 bit.
         channels: As in ``detect_vibration``.
 
@@ -154,15 +125,13 @@ def calibrate_row_time(
             f"flicker_frequency={frequency:g} Hz is slower than a frame of {frame_rate:g} per second: fewer than "
             f"{MIN_PERIODS:g} periods fit into one; use a faster flicker"
         )
-    if on_fraction is not None and light_contrast is not None:
-        raise ValueError("pass on_fraction for an on-off light, or light_contrast for a sinusoidal one, not both")
-    profiles = row_profiles(frames, scan_axis, full_scale, gamma, channels)
+    profiles = row_profiles(frames, scan_axis, full_scale, channels)
     try:
         bands, scene = find_bands(profiles)
     except ValueError as error:
         other: ScanAxis = "y" if scan_axis in (-1, "x") else "x"
         try:
-            find_bands(row_profiles(frames, other, full_scale, gamma, channels))
+            find_bands(row_profiles(frames, other, full_scale, channels))
         except ValueError:
             raise error from None
         raise ValueError(f"there are bands along the other axis of the frames: pass scan_axis={other!r}") from error
@@ -173,26 +142,14 @@ def calibrate_row_time(
         _check_readout(row_time, frequency, height, frame_rate)
     if scene == "smooth" and len(profiles.rows) > 1:
         notes.append("the bands lie at the same rows in all frames, or the scene moves: its texture is not eliminated")
-    direction, contrast, why = _direction(bands, frequency, frame_rate)
-    notes += [f"readout direction unknown: {why}"] if why else []
-    rows, rows_std, note = _exposure_rows(
-        profiles, bands, scene == "fixed", gamma, contrast, on_fraction, light_contrast
-    )
-    exposure, exposure_std = (None, None) if rows is None else (rows * row_time, rows_std * row_time)
-    notes += [f"exposure unknown: {note}" if exposure is None else note] if note else []
     return RowTimeCalibration(
         row_time=row_time,
         row_time_std=row_time * bands.period_std / bands.period,
         period_rows=bands.period,
-        contrast=contrast,
+        contrast=float(np.abs(bands.coefficients[:, 0]).mean()),
         flicker_frequency=frequency,
         frame_rows=None if frame_rate is None else 1 / (frame_rate * row_time),
-        readout_direction=direction,
-        exposure_time=exposure,
-        exposure_time_std=exposure_std,
         notes=tuple(notes),
-        light=torch.from_numpy(bands.fitted + bands.residual),
-        fitted_light=torch.from_numpy(bands.fitted),
     )
 
 
@@ -212,84 +169,3 @@ def _check_readout(row_time: float, frequency: float, height: int, frame_rate: f
             f"flicker_frequency={frequency:g} Hz is ambiguous: row times of {listed} us cause the same bands; "
             f"use at most {0.5 / longest:.0f} Hz"
         )
-
-
-def _direction(
-    bands: BandFit, frequency: float, frame_rate: float | None
-) -> tuple[Literal["forward", "reverse"] | None, float, str]:
-    """Readout direction from consecutive frames, contrast of the light, and why the direction is undetermined.
-
-    The pattern of the scene does not move: the fundamental of frame p is ``d + a exp(-2 pi j p f / frame_rate)`` for
-    forward readout, with the opposite sign of the exponent for reverse readout.
-    """
-    first = bands.coefficients[:, 0]
-    contrast = float(np.abs(first).mean())
-    if len(first) < 2:
-        return None, contrast, "it requires two consecutive frames"
-    if frame_rate is None:
-        return None, contrast, "it requires the frame rate"
-    turns = frequency / frame_rate
-    # turns from the nearest whole or half number; the clocks of light and camera may differ by 1e-4
-    if abs((2 * turns + 0.5) % 1.0 - 0.5) / 2 < 0.03 + 1e-4 * turns * (len(first) - 1):
-        return None, contrast, f"the light makes {turns:.3f} turns a frame, too close to a whole or half number"
-    misfits, amplitudes = zip(*(_turning(first, sign * turns) for sign in (-1, 1)), strict=True)
-    good, bad = min(misfits), max(misfits)
-    if good > 0.1:
-        why = "the motion of the bands does not agree with flicker frequency and frame rate (29.97 is not 30)"
-        return None, contrast, f"{why}: {turns % 1:.3f} turns a frame"
-    if bad < 4.0 * good + 0.01:
-        return None, contrast, "texture of the scene hides the motion of the bands; use more frames, or a plain scene"
-    forward = misfits[0] < misfits[1]
-    return ("forward" if forward else "reverse"), amplitudes[0 if forward else 1], ""
-
-
-def _turning(values: Array, turns: float) -> tuple[float, float]:
-    """Misfit of ``d + a exp(2 pi j p turns)`` to values (T,) over their power with a penalty on d, and |a|."""
-    count = len(values)
-    columns = np.stack([np.ones(count), np.exp(2j * math.pi * turns * np.arange(count))], 1)
-    penalty = 0.3 if count == 2 else 0.03  # two frames alone cannot separate d from a
-    solution = np.linalg.solve(columns.conj().T @ columns + np.diag([penalty, 0.0]), columns.conj().T @ values)
-    cost = (np.abs(values - columns @ solution) ** 2).sum() + penalty * np.abs(solution[0]) ** 2
-    return float(cost / (np.abs(values) ** 2).sum()), float(np.abs(solution[1]))
-
-
-def _exposure_rows(
-    profiles: Profiles,
-    bands: BandFit,
-    fixed: bool,
-    gamma: float,
-    contrast: float,
-    on_fraction: float | None,
-    light_contrast: float | None,
-) -> tuple[float | None, float, str]:
-    """Exposure in rows with its standard deviation and a note, or None, 0 and why it is undetermined."""
-    if profiles.clipped > 0.02 and (on_fraction or light_contrast):
-        return None, 0.0, f"{profiles.clipped:.0%} of the pixels are saturated, which changes the shape of the bands"
-    if light_contrast is not None:
-        noise = math.sqrt((np.abs(bands.coefficients[:, 0]) ** 2).sum() / max(bands.certainty, 1e-9))
-        exposure, further = (
-            exposure_from_contrast(value, light_contrast, bands.period)
-            for value in (contrast, max(contrast - noise / math.sqrt(2), 1e-6))
-        )
-        return exposure, abs(further - exposure), ""
-    if on_fraction is None:
-        return None, 0.0, "it requires on_fraction of an on-off light, or light_contrast of a sinusoidal one"
-    scale = bands.scene.mean(1, keepdims=True)
-    even = profiles.rows / (scale if fixed else bands.scene / scale)
-    other_gamma = 2.2 if gamma < 1.5 else 1.0
-    try:
-        fits, others = (
-            fit_strobe(power, bands.period, bands.phases, on_fraction, fixed=fixed)
-            for power in (even, even ** (other_gamma / gamma))
-        )
-        fits[0].check_shape()
-        # a wrong gamma changes an exposure of 0.2 ms by 20 % and its misfit by a factor of 3 to 70, one of 1.25 periods
-        # by a factor of 1.5
-        if others[0].misfit < 0.8 * fits[0].misfit:
-            raise ValueError(
-                f"the bands agree with gamma={other_gamma:g} (misfit {others[0].misfit:.1%}) rather than with "
-                f"gamma={gamma:g} (misfit {fits[0].misfit:.1%})"
-            )
-        return exposure_from_shape(fits, on_fraction)
-    except ValueError as error:
-        return None, 0.0, str(error)

@@ -14,7 +14,7 @@ from scipy import ndimage
 from rsvib_torch.checks.arrays import Channels, FramesOrFiles, channel_axis
 from rsvib_torch.frames.loading import load_frames
 from rsvib_torch.frames.prepare import as_float_frames
-from rsvib_torch.numerics.tables import Array, scaled_inverse
+from rsvib_torch.numerics.tables import Array
 
 SceneModel = Literal["smooth", "fixed"]
 _TINY = 1e-300  # smallest divisor
@@ -28,12 +28,9 @@ class Profiles:
 
     rows: Array  # (T, H) float64, mean over the columns of each row, first row of the image first
     parts: Array  # (T, P, H) float64, the same for parts of the columns side by side
-    clipped: float  # fraction of all pixels that are saturated
 
 
-def row_profiles(
-    frames: FramesOrFiles, scan_axis: int | str, full_scale: float | None, gamma: float, channels: Channels
-) -> Profiles:
+def row_profiles(frames: FramesOrFiles, scan_axis: int | str, full_scale: float | None, channels: Channels) -> Profiles:
     """Mean brightness of the rows of a stack (T, H, W) or (T, C, H, W)."""
     loaded = load_frames(frames, full_scale)
     images = as_float_frames(loaded.frames, loaded.full_scale, channels=channels).detach()
@@ -49,9 +46,9 @@ def row_profiles(
     share = float((images >= 1.0 - 1e-6).double().mean())
     if share > 0.9 * lit:
         raise ValueError(f"{share:.0%} of the pixels are saturated: take less light or a shorter exposure")
-    linear = images.double().clamp(min=0.0) ** gamma
-    parts = [part.mean(-1).cpu().numpy() for part in linear.tensor_split(min(8, linear.shape[-1]), dim=-1)]
-    return Profiles(linear.mean(-1).cpu().numpy(), np.stack(parts, 1), share)
+    light = images.double().clamp(min=0.0)
+    parts = [part.mean(-1).cpu().numpy() for part in light.tensor_split(min(8, light.shape[-1]), dim=-1)]
+    return Profiles(light.mean(-1).cpu().numpy(), np.stack(parts, 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,17 +58,9 @@ class BandFit:
     period: float  # P in rows
     period_std: float  # its standard deviation in rows, from the residuals with their correlation
     coefficients: Array  # (T, K) complex128, waveform of each frame over its mean
-    scene: Array  # (T, H) float64, brightness of the rows without flicker
-    fitted: Array  # (T, H) float64, light of the rows over its mean: ``1 + sum_k Re[c_pk exp(-2 pi j k i / P)]``
-    residual: Array  # (T, H) float64, residual brightness over that of the scene
     # power of the fundamental over that of residuals at frequencies beside it, in all frames of a fixed scene together
     certainty: float
     evidence: float  # Gaussian log-likelihood less half the number of parameters times log N (BIC)
-
-    @property
-    def phases(self) -> Array:
-        """(T,) phase of the fundamental in each frame, ``cos(2 pi i / P - phase)``."""
-        return np.angle(self.coefficients[:, 0])
 
     @property
     def moves(self) -> bool:
@@ -98,26 +87,23 @@ def _solve(matrix: Array, right: Array) -> Array:
     return found[..., 0]
 
 
-def unexplained(matrix: Array, values: Array) -> Array:
+def _unexplained(matrix: Array, values: Array) -> Array:
     """Residual of a least-squares fit of (T, H, N) to (T, H)."""
     return values - (matrix @ _solve(matrix, values)[..., None])[..., 0]
 
 
-def deviations(jacobian: Array, residual: Array, reach: int) -> Array:
-    """Standard deviations (N,) of fitted parameters, with the correlation of residuals within ``reach`` rows.
+def _deviation(slope: Array, residual: Array, reach: int) -> float:
+    """Standard deviation of a fitted parameter, with the correlation of residuals within ``reach`` rows.
 
-    The derivatives of the model are (T, H, N), the residuals (T, H), weighted by Bartlett's window. The result is not
-    smaller than for residuals without correlation.
+    The derivatives of the model by it, without what other parameters explain, and the residuals are (T, H). Products
+    are weighted by Bartlett's window. The result is not smaller than for residuals without correlation.
     """
-    information = scaled_inverse(np.einsum("tin,tim->nm", jacobian, jacobian))
-    score = jacobian * residual[..., None]
-    reach = min(reach, residual.shape[1] - 1)
+    information = max(float(np.square(slope).sum()), _TINY)
+    score, reach = slope * residual, min(reach, residual.shape[1] - 1)
     window = 1 - np.abs(np.arange(-reach, reach + 1)) / (reach + 1)
-    correlated = np.einsum("tin,tim->nm", score, ndimage.convolve1d(score, window, axis=1, mode="constant"))
-    sums = (correlated, np.einsum("tin,tim->nm", score, score))
-    variances = [np.diag(information @ total @ information) for total in sums]
-    variances.append((residual**2).mean() * np.diag(information))
-    return np.sqrt(np.max(variances, axis=0).clip(min=0.0))
+    correlated = float((score * ndimage.convolve1d(score, window, axis=1, mode="constant")).sum())
+    squares = max(correlated, float(np.square(score).sum()), float(np.square(residual).mean()) * information)
+    return math.sqrt(squares) / information
 
 
 def _fit_period(brightness: Array, start: float, scene: SceneModel) -> BandFit | None:
@@ -172,7 +158,7 @@ def _fit(brightness: Array, period: float, scene: SceneModel, count: int) -> Ban
         fixed = np.concatenate([level[..., None] * basis, pattern[..., None] * smooth], -1)
         shift = level * by_period
         residual = brightness / texture - level * pattern
-        free = unexplained(fixed, shift)  # part of the derivative by the period that the others do not explain
+        free = _unexplained(fixed, shift)  # part of the derivative by the period that the others do not explain
         power = float((free * shift).sum())
         step = float((free * residual).sum()) / power if turn > 2 and power > 0 else 0.0
         change = _solve(fixed, residual - step * shift)
@@ -189,7 +175,7 @@ def _fit(brightness: Array, period: float, scene: SceneModel, count: int) -> Ban
     if scene == "fixed":
         leverage = leverage - pattern * (pattern * leverage).sum(0) / (pattern**2).sum(0).clip(min=_TINY)
     basis = np.broadcast_to(basis, (frames, *basis.shape))
-    leverage = unexplained(np.concatenate([basis, pattern[..., None] * smooth], -1), leverage)
+    leverage = _unexplained(np.concatenate([basis, pattern[..., None] * smooth], -1), leverage)
     back = np.exp(2j * math.pi * centre / period * order)
     coefficients = (waves[:, :count] + 1j * waves[:, count:]) * back
     certainty = _certainty(coefficients, residual, period)
@@ -197,14 +183,11 @@ def _fit(brightness: Array, period: float, scene: SceneModel, count: int) -> Ban
         certainty /= frames
     values = brightness.size / _correlation_rows(residual)  # independent ones
     evidence = -0.5 * values * math.log(float((residual**2).mean()) + _TINY)
-    period_std = float(deviations(leverage[..., None], residual, max(8, math.ceil(period)))[0])
+    period_std = _deviation(leverage, residual, max(8, math.ceil(period)))
     return BandFit(
         period=period,
         period_std=max(period_std, _period_std_beside(leverage, shift, certainty, period)),
         coefficients=coefficients,
-        scene=level * texture,
-        fitted=pattern,
-        residual=residual,
         certainty=certainty,
         evidence=evidence - 0.5 * 2 * count * frames * math.log(values),
     )

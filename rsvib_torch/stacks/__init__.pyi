@@ -6,7 +6,6 @@ from .process import detect_stack as detect_stack
 from .process import iterate_stack as iterate_stack
 from .process import process_stack as process_stack
 from .recorded_motion import align_stack as align_stack
-from .recorded_motion import check_stack_motion as check_stack_motion
 from .recorded_motion import mask_of_regions as mask_of_regions
 from .run_folder import StackReport as StackReport
 from .window_restoration import RestoredFrames as RestoredFrames

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.gyroscope.alignment import ClockAlignment, FittedClock, MotionCheck, align_motion, check_motion
+from rsvib_torch.gyroscope.alignment import ClockAlignment, FittedClock, align_motion
 from rsvib_torch.gyroscope.corner_tracks import corner_tracks
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
 from rsvib_torch.gyroscope.rotation_alignment import AlignOptions, RotationAlignment, align_rates, offset_range, outside
@@ -89,20 +89,10 @@ def align_stack(
         tracks = corner_tracks(_grey_frames(source, info, pairs, ignore), starts, timing)
         return align_rates(tracks, timing, recorded, options)
     runs = compared_runs(info.shape[0])
-    align = partial(align_motion, fit_gain=options.fit_gain, ignore=options.ignore)
+    align = partial(align_motion, ignore=options.ignore)
     if len(runs) == 1:
         return align(*part_of_stack(source, info, timing, runs[0]), recorded, offsets=offsets)
     return _aligned_runs(source, info, timing, recorded, runs, offsets, align)
-
-
-def check_stack_motion(
-    source: Path, info: StackInfo, timing: SensorTiming, motion: FreeMotion, ignore: Tensor | None = None
-) -> MotionCheck:
-    """``check_motion`` for a stack of any length, by the frames in its middle."""
-    timing = timing_from_first_frame(timing, info)
-    runs = compared_runs(info.shape[0])
-    frames, of_run = part_of_stack(source, info, timing, runs[len(runs) // 2])
-    return check_motion(frames, of_run, motion, ignore=ignore)
 
 
 def _grey_frames(
@@ -154,9 +144,8 @@ def _aligned_runs(
     covariance *= max(1.0, rest)
     scale, gradient = 1.0 + float(line[0]), np.array([-middle, 1.0])
     offset, offset_std = float(gradient @ line), math.sqrt(gradient @ covariance @ gradient)
-    # 3. The motion with the gain and drift in the middle of the stack.
-    gain, drift = found[0].gain, found[0].drift
-    clock = FittedClock(offset + scale * middle, scale, gain, tuple(drift.tolist()), middle)
+    # 3. The motion with the drift in the middle of the stack.
+    clock = FittedClock(offset + scale * middle, scale, tuple(found[0].drift.tolist()), middle)
     findings = tuple(outside(offset, offset_std, offsets))
     return replace(
         found[0],

@@ -90,8 +90,8 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     lines = [f"{t:.9g},{x:.9g},{y:.9g}" for t, (x, y) in zip(times.tolist(), path.tolist(), strict=True)]
     motion_file.write_text("\n".join(["time,x,y", *lines]))
     rates_file = folder / "rates.csv"
-    rates_file.write_text("\n".join(["time,gx,gy,gz", *(f"{line},0" for line in lines)]))
-    rates = rsv.read_gyroscope(rates_file, unit="rad/s")
+    rates_file.write_text("\n".join(["time,gx_rad_s,gy_rad_s,gz_rad_s", *(f"{line},0" for line in lines)]))
+    rates = rsv.read_gyroscope(rates_file)
     unit = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     pairs = torch.zeros(2, 3, dtype=torch.float64)
     values = (0.0, 1e-4, 1.0, 1e-4, unit, unit, 500.0, 1.0, 1e-4, 1e-6, pairs, unit, 0.01, unit[:2])
@@ -108,7 +108,6 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     augmentation = rsv.RollingShutterVibration(timing, **random_tones)
     detector = rsv.VibrationDetector(timing, **DETECTION)
     restorer = rsv.VibrationRestorer(timing, method="dewarp", check=False)
-    check = rsv.check_motion(frames, timing, recorded, **BANDS)
     alignment = rsv.align_motion(frames, timing, recorded, offsets=(-0.001, 0.001), **BANDS)
     verdict = rsv.judge_restoration(frames, restored, timing, vibration)
     optics, sensor_noise = rsv.Optics(0.5, 0.4, 1.0), rsv.SensorNoise(5000.0, 0.01, 12, 0.01, 0.01, 0.01, 3)
@@ -154,7 +153,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     new = {name: folder / name for name in ("new.npy", "new.mkv", "figure.png", "rates.gcsv", "maps")}
     with_camera = vibration.with_camera(rsv.Camera(900.0))
     different: dict[str, dict[str, Any]] = {  # values that differ from the pool, by function
-        "align_motion": {"camera": None, "fit_gain": True},
+        "align_motion": {"camera": None},
         "calibrate_row_time": {"frames": stripes},
         "calibrate_row_time_by_motion": {"row_time": (5e-5, 2e-4)},
         "comparison_figure": {"size": 32, "restored": restored[0]},
@@ -165,7 +164,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
         "process_stack": {"sink": new["new.npy"], **windows},
         "process_video": {"source": video, "sink": new["new.mkv"], "restoration": {"method": "dewarp"}},
         "psnr": {"image": restored, "reference": frames},
-        "read_gyroscope": {"path": rates_file, "unit": "rad/s", "time_unit": "s"},
+        "read_gyroscope": {"path": rates_file},
         "read_manifest": {"path": folder / "out.npy.manifest.json"},
         "read_motion": {"path": motion_file, "unit": "rad", "focal_length": 100.0},
         "read_vibration": {"path": folder / "vibration.json"},
@@ -218,7 +217,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     described += (detected.spectrum(), rsv.CameraMode("A", "B", "", 1920, 1080, 30.0, 0.01, 1e-4, 3, "forward", 1080))
     of_frame = {one.name: getattr(detected, one.name) for one in fields(rsv.FollowedVibration) if one.name != "times"}
     described += (rsv.FollowedVibration(**of_frame, times=times[0]),)
-    described += (detected, detected.offsets, free, check, alignment, rates, rotation)
+    described += (detected, detected.offsets, free, alignment, rates, rotation)
     for value in described:
         result[type(value).__name__] = _with_fields(value)
     for value in (vibration, recorded, timing, *described):

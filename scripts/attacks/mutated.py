@@ -73,7 +73,7 @@ ORIGINALS: dict[str, Callable[[Path], Any]] = {
     "camera.toml": read_config,
     "motion.csv": lambda path: str(rsv.read_motion(path, unit="px")),
     "clip.gcsv": lambda path: str(rsv.read_gyroscope(path)),
-    "rates.csv": lambda path: str(rsv.read_gyroscope(path, unit="rad/s")),
+    "rates.csv": lambda path: str(rsv.read_gyroscope(path)),
     "clip.mp4": lambda path: str(rsv.read_gyroscope(path)),
     "out.npy.manifest.json": _read_manifest,
     "vibration.json": lambda path: str(read_vibration(path, TIMING)),
@@ -115,7 +115,7 @@ def write_originals(folder: Path) -> dict[str, bytes]:
     (folder / "motion.csv").write_text("\n".join(["time,x,y", *lines]))
     head = ["GYROFLOW IMU LOG", "version,1.3", "orientation,YxZ", "tscale,1", "gscale,1", "t,gx,gy,gz"]
     (folder / "clip.gcsv").write_text("\n".join([*head, *(f"{line},0" for line in lines)]))
-    (folder / "rates.csv").write_text("\n".join(["time,gx,gy,gz", *(f"{line},0" for line in lines)]))
+    (folder / "rates.csv").write_text("\n".join(["time,gx_rad_s,gy_rad_s,gz_rad_s", *(f"{line},0" for line in lines)]))
     mp4(folder / "clip.mp4", packets_of())
     return {name: (folder / name).read_bytes() for name in ORIGINALS}
 

@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     size = tuple(options.size)
     generator = torch.Generator().manual_seed(options.seed)
     ground = city_and_fields(size[0] + 2 * MARGIN, size[1] + 2 * MARGIN, options.seed)
-    timing = rsv.SensorTiming.line_sensors(LINE_TIME, DELAYS, size[0], exposure_lines=4)
+    timing = rsv.SensorTiming(LINE_TIME, 4, size[0], frame_start_times=DELAYS)
     noise = rsv.SensorNoise(read_noise=NOISE)
     images = rsv.simulate_frames(ground, timing, JITTER, len(DELAYS), frame_size=size, noise=noise, generator=generator)
     still = ground[MARGIN:-MARGIN, MARGIN:-MARGIN]
@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     table = Table("", "along the lines (x)", "across (y)", "PSNR", box=box.SIMPLE_HEAD)
     table.add_row("truth", *(_tone(JITTER, axis) for axis in range(2)), f"{quality(images[:1]):.1f} dB input")
     for count in (2, 3):
-        lines = rsv.SensorTiming.line_sensors(LINE_TIME, DELAYS[:count], size[0], exposure_lines=4)
+        lines = rsv.SensorTiming(LINE_TIME, 4, size[0], frame_start_times=DELAYS[:count])
         found = rsv.detect_vibration(images[:count], lines)
         cells = [
             _tone(found.vibration, axis) if found.reliable[axis] else f"refused: {found.reasons[axis][0]}"

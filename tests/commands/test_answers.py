@@ -112,7 +112,7 @@ WORK = {  # arguments of a command, results that it does not replace, and keys o
     "restore by a recording": (
         "long.tif {}/r.tif --motion m.csv --unit px --offset 0",
         "r.tif",
-        "alignment check restoration",
+        "alignment restoration",
     ),
 }
 
@@ -145,8 +145,6 @@ def test_json_is_the_only_output(command, capsys):
         assert answer["detection"]["vibration"]["amplitude"][0][0] == pytest.approx(1.6, rel=0.01)
     if "restoration" in keys:
         assert (answer["restoration"]["axes"], answer["restoration"]["outcome"]) == (["x", "y"], "helps")
-    if "check" in keys:
-        assert answer["check"]["helps"] is True
 
 
 def test_existing_results_are_not_replaced(command, tmp_path, capsys):

@@ -112,7 +112,7 @@ def test_columns_with_detail_are_selected(pairs, paper_camera):
 def test_jitter_of_line_sensors_is_measured_and_removed(delay_lines):
     """Two lines record the same ground with a delay, which is the frame period of the simulator, below the image."""
     lines, line_time, jitter = 900, 1e-4, Motion(amplitude=(1.4, 0.9), frequency=(31.0, 44.0))
-    timing = SensorTiming.line_sensors(line_time, [0.0, delay_lines * line_time], lines, 4)
+    timing = SensorTiming(line_time, 4, lines, frame_start_times=[0.0, delay_lines * line_time])
     ground = draw_scene(lines + 2 * MARGIN, 192 + 2 * MARGIN, 9)
     camera = SensorTiming(row_time=line_time, exposure_rows=4, frame_rows=delay_lines)
     taken = torch.from_numpy(take_frames(ground, camera, jitter, 2, 0.005)).float()

@@ -22,17 +22,17 @@ def write(path, columns, names="time,x,y"):
 def test_angles_are_converted_to_pixels(tmp_path, unit, size):
     x, y = 0.01 * np.sin(9 * CLOCK), 0.02 * np.cos(5 * CLOCK)
     path = write(tmp_path / "a.csv", (CLOCK, x / size, y / size))
-    motion = read_motion(path, unit=unit, focal_length=1000.0, signs=(1, -1))
+    motion = read_motion(path, unit=unit, focal_length=1000.0)
     expected = 1000 * np.tan(np.stack([x - x.mean(), y - y.mean()], -1))
-    expected = (expected - expected.mean(0)) * [1, -1]
+    expected = expected - expected.mean(0)
     assert np.allclose(motion.displacement(torch.from_numpy(CLOCK)).numpy(), expected, atol=1e-3)
 
 
-def test_rates_are_integrated_and_times_scaled(tmp_path):
+def test_rates_are_integrated(tmp_path):
     x, y = 0.01 * np.sin(9 * CLOCK), 0.02 * np.cos(5 * CLOCK)
     rates = np.degrees(0.09 * np.cos(9 * CLOCK)), np.degrees(-0.1 * np.sin(5 * CLOCK))
-    path = write(tmp_path / "a.csv", (1e3 * CLOCK, CLOCK, *rates), " Time (ms), other, X(rad/s), y")
-    motion = read_motion(path, unit="deg/s", focal_length=1000.0, time_unit="ms")
+    path = write(tmp_path / "a.csv", (CLOCK, CLOCK, *rates), " Time (s), other, X(deg/s), y")
+    motion = read_motion(path, unit="deg/s", focal_length=1000.0)
     found = motion.displacement(torch.from_numpy(CLOCK)).numpy()
     assert np.allclose(found[:, 0] - found[:, 0].mean(), 1000 * (x - x.mean()), atol=0.02)
     assert np.allclose(found[:, 1] - found[:, 1].mean(), 1000 * (y - y.mean()), atol=0.02)
@@ -50,7 +50,7 @@ def changed(place, time):
         (changed(7, 0.001), CLOCK, {}, "times must increase, but sample 8"),
         (np.concatenate([CLOCK[:50], CLOCK[60:]]), CLOCK[10:], {}, r"gap of 0\.055 s after 0\.245 s"),
         (CLOCK, changed(4, np.nan), {}, "line 6: x must be a number"),
-        (1e3 * CLOCK, CLOCK, {}, "check time_unit='s'"),
+        (1e3 * CLOCK, CLOCK, {}, "times must be in s"),
         (CLOCK, 20 * CLOCK, {"unit": "rad", "focal_length": 1000}, "check unit='rad'"),
         (CLOCK, CLOCK, {"unit": "rad"}, "needs a focal_length"),
         (CLOCK[:3], CLOCK[:3], {}, "3 samples"),
