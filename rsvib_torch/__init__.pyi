@@ -67,12 +67,10 @@ from .report import windows_figure as windows_figure
 from .report import write_offsets as write_offsets
 from .report import write_table as write_table
 from .restoration import FixedDewarp as FixedDewarp
-from .restoration import RestorationMtf as RestorationMtf
 from .restoration import RestorationVerdict as RestorationVerdict
 from .restoration import RestorationWarning as RestorationWarning
 from .restoration import VibrationRestorer as VibrationRestorer
 from .restoration import judge_restoration as judge_restoration
-from .restoration import restoration_mtf as restoration_mtf
 from .restoration import restore as restore
 from .restoration import trusted_vibration as trusted_vibration
 from .restoration import visible_pixels as visible_pixels

@@ -236,8 +236,7 @@ class ExactOptions(JointOptions):
     """Points of the restored frames per pixel along both axes, 1 or 2. With 2, the unknown is the scene after optics
     and pixel on a grid of half pixels, and aliasing is part of the model: several frames that sample between each
     other's pixels contain detail beyond half a cycle per px, one frame does not. The prior is then a polynomial in the
-    Laplacians of both axes (``PolynomialPrior``). ``restoration_mtf`` measures which detail the restored frames
-    contain."""
+    Laplacians of both axes (``PolynomialPrior``)."""
     mosaic: Mosaic | None = Field(default=None, json_schema_extra=COMMAND_LINE)
     """Colours of the pixels (0, 0), (0, 1), (1, 0), (1, 1) of raw frames (T, H, W) or (T, 1, H, W) behind colour
     filters: ``"RGGB"``, ``"BGGR"``, ``"GRBG"`` or ``"GBRG"``. The restored frames have three channels R, G, B, see
@@ -323,11 +322,6 @@ class RestorerOptions(RestorationOptions, InputOptions):
 @options
 class RestoreOptions(RestorerOptions, MaskedInputOptions):
     """Options of ``restore``."""
-
-
-@options
-class RestorationMtfOptions(RestorationOptions, MaskedInputOptions):
-    """Options of ``restoration_mtf``."""
 
 
 @options

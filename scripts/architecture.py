@@ -65,7 +65,6 @@ INNER_LAYERS: dict[str, tuple[set[str], ...]] = {
         {"exact", "banded", "dewarp", "verdict"},
         {"richardson_lucy"},
         {"restore"},
-        {"restoration_mtf"},
     ),
 }
 

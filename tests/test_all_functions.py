@@ -126,7 +126,6 @@ CASES = (
         ),
         "detect_vibration, bands": (partial(detect, method="bands", harmonics=2), FRAMES),
         "align_motion": (lambda frames: rsv.align_motion(frames, TIMING, MOTION, offsets=(-0.002, 0.002)), FRAMES),
-        "restoration_mtf": (lambda frames: rsv.restoration_mtf(frames, TIMING, VIBRATION, joint=True, scale=2), FRAMES),
         "restore, holes": (lambda frames, ignore: restore(frames, ignore=ignore, **HARD), FRAMES, FRAMES > 0.8),
         "RowVaryingBlur.A_adjoint": (rsv.RowVaryingBlur(PSF).A_adjoint, FRAMES[0, :8]),
         "restore, no axis": (partial(restore, vibration=REFUSED), FRAMES),

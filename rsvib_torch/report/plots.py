@@ -35,7 +35,7 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.numerics.tables import Array, true_runs
 from rsvib_torch.registration import OffsetCurve
-from rsvib_torch.restoration import RestorationMtf, RestorationVerdict
+from rsvib_torch.restoration import RestorationVerdict
 from rsvib_torch.results.presentation import AXIS_NAMES, AXIS_UNITS, FIGURES
 from rsvib_torch.results.result_files import figure_png
 from rsvib_torch.stacks import StackManifest
@@ -420,19 +420,12 @@ def mtf_figure(curves: Mapping[str, Sequence[MtfCurve]]) -> Figure:
         for value in values:
             panel.plot(frequency, value, color=colour, linewidth=0.7, alpha=0.5)
         panel.plot(frequency, torch.stack(values).mean(0), color=colour, linewidth=2.0, label=name)
-    _finish_mtf(panel, 0.5, "MTF")
-    return figure
-
-
-def _finish_mtf(panel: Axes, highest: float, label: str, legend: str | None = None) -> None:
-    """Add half of the contrast, the Nyquist frequency of the pixels, labels and a legend to transfer functions."""
     panel.axhline(0.5, color=_GREY, linewidth=0.8, linestyle="--", zorder=0)
-    if highest > 0.5:
-        panel.axvline(0.5, color=_GREY, linewidth=0.8, linestyle=":", zorder=0)
-    panel.set_xlim(0, highest)
+    panel.set_xlim(0, 0.5)
     panel.set_ylim(0, max(1.05, panel.get_ylim()[1]))
-    panel.legend(title=legend, **_LEGEND)
-    plain_axes(panel, "spatial frequency (cycles/px)", label)
+    panel.legend(**_LEGEND)
+    plain_axes(panel, "spatial frequency (cycles/px)", "MTF")
+    return figure
 
 
 def detailed_places(image: Tensor, size: int, count: int, rim: int = 0) -> list[tuple[int, int]]:
@@ -505,15 +498,6 @@ def picture(frame: Tensor) -> Tensor:
     frame = frame[None] if frame.ndim == 2 else frame
     frame = frame[:3] if frame.shape[0] >= 3 else frame.mean(0, keepdim=True)
     return frame.movedim(0, -1)
-
-
-def _restoration_mtf_figure(result: RestorationMtf) -> Figure:
-    figure, ((panel,),) = _panels(5.6, 3.9)
-    for name, values, limit in zip("xy", result.mtf, result.resolution.tolist(), strict=True):
-        label = f"{name}: 0.5 at {limit:.2f} cycles/px"
-        panel.plot(result.frequency, values, color=_AXIS_COLOURS[name], linewidth=2.0, label=label)
-    _finish_mtf(panel, float(result.frequency[-1]), "MTF of the restoration", f"noise gain {result.noise_gain:.2f}")
-    return figure
 
 
 def _measured_offsets_figure(curve: OffsetCurve) -> Figure:
@@ -606,7 +590,6 @@ FIGURES.update(
         (MtfCurve, 0): lambda curve: mtf_figure(
             {f"MTF50 {measured_text(curve.mtf50, curve.mtf50_std)} cycles/px": [curve]}
         ),
-        (RestorationMtf, 0): _restoration_mtf_figure,
         (OffsetCurve, 0): _measured_offsets_figure,
         (RestorationVerdict, 0): _verdict_figure,
         (StackManifest, 0): lambda manifest: windows_figure(manifest.times(), manifest.detections()),

@@ -1,7 +1,6 @@
 from .dewarp import FixedDewarp
 from .frame_motion import visible_pixels
 from .noise import estimate_noise
-from .restoration_mtf import RestorationMtf, restoration_mtf
 from .restoration_warning import RestorationWarning
 from .restore import VibrationRestorer, check_optics, restore
 from .verdict.judge import judge_restoration
@@ -11,7 +10,6 @@ from .verdict.trust import displacement_uncertainty, trusted_vibration
 
 __all__ = [
     "FixedDewarp",
-    "RestorationMtf",
     "RestorationVerdict",
     "RestorationWarning",
     "TooLittleInCommonError",
@@ -20,7 +18,6 @@ __all__ = [
     "displacement_uncertainty",
     "estimate_noise",
     "judge_restoration",
-    "restoration_mtf",
     "restore",
     "trusted_vibration",
     "visible_pixels",

@@ -213,7 +213,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     result["RollingShutterVibration.drawn_vibration"] = call(augmentation.drawn_vibration)
     report = rsv.process_stack(stack, folder / "again.npy", timing, **windows)
     described = (detected.std, curve, optics, sensor_noise, info, report, verdict, calibration, camera)
-    described += (tracked, rsv.restoration_mtf(frames, timing, vibration))
+    described += (tracked,)
     described += (detected.spectrum(), rsv.CameraMode("A", "B", "", 1920, 1080, 30.0, 0.01, 1e-4, 3, "forward", 1080))
     of_frame = {one.name: getattr(detected, one.name) for one in fields(rsv.FollowedVibration) if one.name != "times"}
     described += (rsv.FollowedVibration(**of_frame, times=times[0]),)

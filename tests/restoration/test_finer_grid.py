@@ -10,7 +10,7 @@ from benchmarks.independent_camera import Shake, after_optics, closed, still_ima
 from exact_steps import model_of, solved
 from field_truth import FieldMotion, take_field_frames
 from finer_truth import FINER, SHAKE, TIMING, VIBRATION, check_gradient, noisy, taken
-from refusals import refuses, without_warning
+from refusals import without_warning
 from truth import decibel, draw_scene
 
 import rsvib_torch as rsv
@@ -144,45 +144,6 @@ def test_gradients(frames):
         return solved(stack, joint=True, prior=prior).square().mean()
 
     check_gradient(energy, images, rel=0.02)
-
-
-def test_mtf_predicts_the_contrast_of_waves(scene):
-    """The restored contrast of weak waves in a textured scene, from frames of an independent camera."""
-    noise = 0.02
-    frames = noisy(frames_of(scene, 4).numpy(), noise)
-    curve = rsv.restoration_mtf(frames, TIMING, VIBRATION, joint=True, scale=2)
-    plain = restored(frames)[0].double().numpy()
-    for axis in (0, 1):
-        for wanted in (0.3, 0.8) if axis else (0.55, 0.8):
-            values, cycles = wave(wanted, axis)
-            grating = after_optics(0.1 * noise * values, 0.3)  # too weak to change the prior
-            true = contrast(still_image(grating, (SIZE, SIZE), 2), cycles, axis)
-            clean = frames_of(grating, 4) - frames_of(0 * grating, 4)
-            found = contrast(restored(frames + clean)[0].double().numpy() - plain, cycles, axis)
-            predicted = np.interp(cycles, curve.frequency.numpy(), curve.mtf[axis].numpy())
-            assert found / true == pytest.approx(predicted, abs=0.08)
-    assert (curve.mtf[:, -1] < 0.3).all()
-    assert ((curve.resolution > 0.5) & (curve.resolution < 0.9)).all()
-    more = frames + 0.1 * noise * torch.randn(frames.shape, generator=torch.Generator().manual_seed(2))
-    change = (restored(more)[0] - restored(frames)[0])[16:-16, 16:-16].square().mean().sqrt() / (0.1 * noise)
-    assert curve.noise_gain == pytest.approx(float(change), rel=0.1)
-
-
-def test_mtf_of_pixels_orientations_and_errors(frames):
-    curve = rsv.restoration_mtf(frames[:2], TIMING, VIBRATION, joint=True)
-    assert curve.frequency.max() <= 0.5
-    sideways = rsv.SensorTiming(20.52e-6, 20, 571, scan_axis=-1)
-    turned = rsv.restoration_mtf(
-        frames[:2].transpose(-2, -1), sideways, rsv.Vibration([5.2, 3.1], [61.0, 90.0], [1.3, 0.4]), joint=True
-    )
-    assert torch.allclose(turned.mtf, curve.mtf.flip(0), atol=1e-4)
-    assert "noise gain" in str(curve)
-    refuses(lambda: rsv.restoration_mtf(frames, TIMING, VIBRATION, prior="edges"), "requires a linear restoration")
-    refuses(lambda: rsv.restoration_mtf(frames[None, :, None], TIMING, VIBRATION), "one stack of frames")
-    refuses(lambda: rsv.restoration_mtf(frames, TIMING, VIBRATION, mosaic="RGGB"), "mosaic='RGGB'")
-    sharper = rsv.restoration_mtf(frames[:2], TIMING, VIBRATION, joint=True, optics=rsv.Optics(sigma=0.9))
-    assert (sharper.mtf >= curve.mtf - 1e-3).all()
-    assert sharper.mtf.max() > 1.2  # the contrast before the optics
 
 
 def test_frames_that_sample_the_same_points_are_reported(scene, truth):
