@@ -188,15 +188,6 @@ class JointOptions:
 
 
 @options
-class ChunkOptions:
-    """Memory of the methods that restore rows one after the other."""
-
-    chunk_rows: Count | None = None
-    """Rows (``banded``: slabs) restored at a time; bounds the memory, does not change the result. None: a suitable
-    number."""
-
-
-@options
 class OpticsOptions:
     """Transfer function of a lens and of square pixels, see ``Optics``."""
 
@@ -223,15 +214,6 @@ class ExactOptions(JointOptions):
     distinguished with two frames or with blur, and only within bounds with one sharp frame, see ``noise_levels``."""
     regularisation: Positive = 1.0
     """Factor on the prior; 1 is the strength estimated from the frames."""
-    chunk_frequencies: Count | None = None
-    """Frequencies solved at a time; fewer need less memory and do not change the result. None: as many as take 8 times
-    the memory of the spectrum of the scene, or 16 times where the displacement changes by more than a pixel during an
-    exposure. While missing values or the boundary extension are filled, the factors of all frequencies stay in memory,
-    and this option does not bound it."""
-    segments: Count | None = None
-    """Overlapping segments of rows that are solved side by side, which changes the result by about 1e-5; None: segments
-    of at least 512 rows on a CPU, 256 on a GPU. Always one where the displacement changes by more than a pixel during
-    an exposure: rows then depend on distant rows."""
     scale: Literal[1, 2] = Field(default=1, json_schema_extra=COMMAND_LINE)
     """Points of the restored frames per pixel along both axes, 1 or 2. With 2, the unknown is the scene after optics
     and pixel on a grid of half pixels, and aliasing is part of the model: several frames that sample between each
@@ -248,7 +230,7 @@ class ExactOptions(JointOptions):
 
 
 @options
-class BandedOptions(ChunkOptions):
+class BandedOptions:
     """Options of method ``"banded"``."""
 
     half_rows: Count = 16
@@ -263,8 +245,8 @@ class BandedOptions(ChunkOptions):
 
 
 @options
-class DewarpOptions(ChunkOptions):
-    """Options of method ``"dewarp"``."""
+class DewarpOptions:
+    """Options of method ``"dewarp"``: none."""
 
 
 @options
@@ -306,8 +288,8 @@ class RestorationOptions(ExactOptions, BandedOptions, DewarpOptions, RichardsonL
         for group in METHOD_OPTIONS.values():
             for name, field in fields_of(group).items():
                 if name not in names and getattr(self, name) != field.default:
-                    of_method = f"method={self.method!r}; its options are {', '.join(names)}"
-                    raise ValueError(f"{name} is no option of {of_method}")
+                    own = f"; its options are {', '.join(names)}" if names else ", which has none"
+                    raise ValueError(f"{name} is no option of method={self.method!r}{own}")
 
 
 @options

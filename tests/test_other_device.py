@@ -80,7 +80,6 @@ WORK = {
     ),
     "free": lambda images, timing: rsv.detect_motion(images, timing).motion,
     "exact": lambda images, timing: rsv.restore(images, timing, SHAKE),
-    "exact, segments": lambda images, timing: rsv.restore(images, timing, SHAKE, segments=2, chunk_frequencies=16),
     "exact, long exposures": lambda images, timing: rsv.restore(images, timing, SHAKE),
     "joint": lambda images, timing: rsv.restore(images, timing, SHAKE, joint=True),
     "edges": lambda images, timing: rsv.restore(images, timing, SHAKE, prior="edges"),

@@ -93,15 +93,13 @@ def restore_banded(given: MovingFrames, options: BandedOptions) -> Tensor:
     frames, motion = given.images, given.motion
     half_rows = check_whole_number("half_rows", options.half_rows, at_least=1, at_most=max(16, frames.shape[-2]))
     stride = check_whole_number("stride", options.stride, at_least=1, at_most=max(2, frames.shape[-2]))
-    interpolation, chunk_rows = options.interpolation, options.chunk_rows
+    interpolation = options.interpolation
     weights = _noise_to_signal(frames, options.noise_to_signal)
     B, T, C, H, W = frames.shape
     length = extended_length(W, motion.displacement_bound() + 8)  # px by which a Wiener filter extends beyond it
     size = 2 * half_rows + 1
     u = torch.fft.rfftfreq(length, dtype=torch.float64, device=frames.device)
     v = torch.fft.fftfreq(size, dtype=torch.float64, device=frames.device)
-    if chunk_rows is None:
-        chunk_rows = at_once(16 * size * len(u), frames.device)  # bytes of a filter bank
 
     # one slab for every `stride` scene rows: its middle, the frame row at which it appears, the motion relative to it
     centres = torch.arange((stride - 1) // 2, H + stride - 1, stride, device=frames.device)[: -(-H // stride)]
@@ -122,7 +120,7 @@ def restore_banded(given: MovingFrames, options: BandedOptions) -> Tensor:
     kept = torch.arange(stride, device=frames.device) - (stride - 1) // 2
     spectra = _aligned_spectra(frames, motion, u, length)
     restored = frames.new_empty(B * T * len(centres), stride, C, W)
-    chunks = runs(len(slab_rows), chunk_rows)
+    chunks = runs(len(slab_rows), at_once(16 * size * len(u), frames.device))  # bytes of a filter bank
     advance = steps(len(chunks), "chunks")
     for chunk in chunks:
         bank = _filters(displacement[chunk], node_weights, grid, weight[chunk], interpolation)

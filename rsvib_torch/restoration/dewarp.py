@@ -60,7 +60,7 @@ def restore_dewarp(given: MovingFrames, options: DewarpOptions = DewarpOptions()
     def rows_of(moved: Tensor) -> Tensor:
         return torch.fft.irfft(torch.view_as_complex(moved), n=length)[..., : frames.shape[-1]]
 
-    return _moved_back(spectra, moves, rows_of, options.chunk_rows or _CHUNK_ROWS)
+    return _moved_back(spectra, moves, rows_of, _CHUNK_ROWS)
 
 
 def _moved_back(spectra: Tensor, moves: _Moves, rows_of: Callable[[Tensor], Tensor], chunk_rows: int) -> Tensor:

@@ -145,7 +145,7 @@ def test_options_of_restoration_come_from_config_or_command_line(place, tmp_path
     at_rest = read_stack(place / "scene.png")[0, 32:-32, 32:-32]
     assert decibel(read_stack(out / "restored.tif")[0], at_rest.numpy()) > 40
     for options, message in (
-        (("--method", "dewarp", "--joint", "2"), "joint is no option of method='dewarp'; its options are chunk_rows"),
+        (("--method", "dewarp", "--joint", "2"), "joint is no option of method='dewarp', which has none"),
         (("--method", "exact", "--joint", "many"), "--joint must be 'all' or a number of frames, got 'many'"),
     ):
         assert message in refused(capsys, *common, *options)

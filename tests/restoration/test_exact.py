@@ -1,4 +1,4 @@
-"""Method ``"exact"``: its solver, accuracy, segments, gradients, prior of edges, and strength of the prior."""
+"""Method ``"exact"``: its solver, accuracy, windows of rows, gradients, prior of edges, and strength of the prior."""
 
 from dataclasses import replace
 from functools import partial
@@ -16,7 +16,7 @@ from rsvib_torch.restoration import restore as restore_by_any_method
 from rsvib_torch.restoration import visible_pixels
 from rsvib_torch.restoration.exact.exact import model_frames
 from rsvib_torch.restoration.exact.priors import PRIORS, Prior, shrink_patches
-from rsvib_torch.restoration.exact.scene_solver import Partition, SceneSolver
+from rsvib_torch.restoration.exact.scene_solver import SceneSolver
 from rsvib_torch.restoration.frame_motion import MovingFrames, frame_motion
 from rsvib_torch.restoration.scene_model.observation import Observation, RowKernels
 from rsvib_torch.restoration.scene_model.scene_prior import RowPrior, fit_prior
@@ -109,40 +109,31 @@ def test_push_scan_frames_are_joined_where_they_overlap():
 
 
 @pytest.mark.parametrize("joint", [False, True])
-def test_results_do_not_depend_on_segments(short, joint):
-    _, frames, motion = short
-    frames = with_noise(frames, 0.02)[..., :64]
-    frames = torch.cat([frames, frames.flip(-2)], dim=-2).requires_grad_()
-    frames.data[:, 100:102, 40:42] = float("nan")
-    whole, split = (
-        restore(frames, TIMING, motion.vibration(), segments=segments, check=False, joint=joint) for segments in (1, 3)
-    )
-    torch.testing.assert_close(split, whole, rtol=0, atol=2e-5)
-    gradients = [torch.autograd.grad(image[..., 150:, :].square().sum(), frames)[0] for image in (whole, split)]
-    torch.testing.assert_close(gradients[1], gradients[0], rtol=0, atol=2e-4)
-    with torch.no_grad():
-        for chunk in (None, 7, 1000):
-            again = restore(
-                frames, TIMING, motion.vibration(), segments=3, chunk_frequencies=chunk, check=False, joint=joint
-            )
-            torch.testing.assert_close(again, whole.detach(), rtol=0, atol=2e-5)
+def test_windows_of_rows_are_joined_without_a_seam(joint):
+    """The rows around the seam of two windows equal those of a part of the frames that is one window."""
+    timing = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
+    vibration = Vibration([3.1, 5.2], [50.0, 30.0], [0.7, 2.1])
+    scene = city_and_fields(1200 + 96, 64 + 96, seed=4)
+    frames = simulate_frames(scene, timing, vibration, 2, frame_size=(1200, 64))
+    frames = frames + 0.005 * torch.randn(frames.shape, generator=torch.Generator().manual_seed(5))
+    whole = model_of(frames, timing, vibration, noise=0.005)
+    later = timing.frame_starts(2) + 400 * timing.row_time
+    timing = replace(timing, frame_start_times=tuple(later.tolist()))
+    part = model_of(frames[:, 400:800], timing, vibration, noise=0.005)
+    at_seam = slice(500, 700)
+    expected = solved(part, joint=joint, prior=whole.prior, mean=whole.mean)
+    torch.testing.assert_close(solved(whole, joint=joint)[:, at_seam], expected[:, 100:300], rtol=0, atol=3e-5)
 
 
-@pytest.mark.parametrize("exposure", [20, 300])
-def test_segments_are_used_only_without_blur(exposure):
-    """At 300 rows of exposure and no noise, errors of segments would exceed the brightness of the scene."""
-    timing = SensorTiming(row_time=20.52e-6, exposure_rows=exposure, frame_rows=2048)
+def test_rows_are_not_divided_where_exposures_blur():
+    """At 300 rows of exposure and no noise, errors of windows would exceed the brightness of the scene."""
+    timing = SensorTiming(row_time=20.52e-6, exposure_rows=300, frame_rows=2048)
     vibration = Vibration([3.1, 5.2], [50.0, 30.0], [0.7, 2.1])
     scene = city_and_fields(1200 + 96, 64 + 96, seed=4)
     frames = simulate_frames(scene, timing, vibration, 1, frame_size=(1200, 64))
-    whole = restore(frames, timing, vibration, segments=1, check=False)
-    for segments, windows in ((None, 2), (4, 4)):
-        _, used = Partition(segments=segments).divide(1220, 7, 50, frames.device, blurred=exposure == 300, keep=False)
-        assert len(used) == (1 if exposure == 300 else windows)
-        restored = restore(frames, timing, vibration, check=False, segments=segments)
-        torch.testing.assert_close(restored, whole, rtol=0, atol=3e-5)
+    restored = restore(frames, timing, vibration, check=False)
     inner = (0, slice(48, -48), slice(16, -16))
-    assert psnr(whole[inner], scene[48:-48, 48:-48][inner[1:]], 1.0) > (35 if exposure == 300 else 50)
+    assert psnr(restored[inner], scene[48:-48, 48:-48][inner[1:]], 1.0) > 35
 
 
 @pytest.mark.parametrize("joint", [False, True])
@@ -361,11 +352,11 @@ def test_fast_path_agrees_with_the_plain_path(reach):
     u = torch.fft.rfftfreq(length, dtype=torch.float64)[None]
     precision = smooth_prior(u).precision(0.01 * (1 + (10 * u).square()))
     data = torch.randn(1, 1, 1, rows, length, dtype=torch.float64, generator=generator)
-    fast = SceneSolver(observation, precision, Partition(chunk=100)).fit(data)
-    plain = SceneSolver(observation, precision.clone().requires_grad_(), Partition(chunk=100)).fit(data)
+    fast = SceneSolver(observation, precision).fit(data)
+    plain = SceneSolver(observation, precision.clone().requires_grad_()).fit(data)
     assert plain.requires_grad
     difference = (fast - plain.detach()).abs().square().mean().sqrt() / plain.detach().abs().square().mean().sqrt()
     assert 1e-12 < difference < 1e-2  # interpolated, not factored: white noise is the least favourable data
-    repeated = SceneSolver(observation, precision, Partition(chunk=100), keep=True)
+    repeated = SceneSolver(observation, precision, keep=True)
     for _ in range(2):
         torch.testing.assert_close(repeated.fit(data), plain.detach())

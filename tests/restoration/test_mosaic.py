@@ -13,7 +13,6 @@ import rsvib_torch as rsv
 from rsvib_torch.frames.mosaic import colour_frames, is_mosaic
 from rsvib_torch.restoration import RestorationWarning
 from rsvib_torch.restoration.exact.mosaic_scene import MosaicSolver
-from rsvib_torch.restoration.exact.scene_solver import Partition
 from rsvib_torch.restoration.frame_motion import frame_motion
 from rsvib_torch.restoration.scene_model.finer_grid import FinerObservation, PolynomialPrior
 
@@ -153,7 +152,7 @@ def test_gradient_of_the_least_squares_solution():
         prior.precision(torch.tensor(1e-4 * factor), blur_reach=kernels.blur_reach) for factor in (1.0, 4.0, 4.0)
     ]
     weights = (torch.rand(2, 3, 24, 32, generator=generator, dtype=torch.float64) < 0.4).double()
-    solver = MosaicSolver(observation, weights, precisions, Partition())
+    solver = MosaicSolver(observation, weights, precisions)
     check_gradient(
         lambda data: solver.image(solver.fit(data, iterations=12)).square().mean(),
         torch.rand(2, 3, 24, 32, generator=generator, dtype=torch.float64),

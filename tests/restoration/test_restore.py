@@ -232,22 +232,14 @@ def test_saturated_pixels_do_not_lower_the_noise_level():
     assert estimated > given - 0.5
 
 
-INVARIANT: dict[str, tuple[dict, dict]] = {  # options of every method, and one that must not change the result
-    "exact": ({}, {"chunk_frequencies": 7}),
-    "banded": ({}, {"chunk_rows": 7}),
-    "dewarp": ({}, {"chunk_rows": 13}),
-    "richardson-lucy": ({"iterations": 3}, {}),
-}
 PUSH_SCAN = ([1.5, 2.0], [71.0, 113.0], [0.4, 1.3], [300.0, -100.0])  # amplitude, frequency, phase, image motion
 
 
-@pytest.mark.parametrize("method", INVARIANT)
-def test_channels_and_chunks_do_not_change_the_result(scene_and_frames, method):
-    options, chunks = INVARIANT[method]
+@pytest.mark.parametrize("method", ["exact", "banded", "dewarp", "richardson-lucy"])
+def test_channels_do_not_change_the_result(scene_and_frames, method):
     stack, vibration = scene_and_frames[1][:, :96, :80].double(), Vibration(*PUSH_SCAN)
-    common = {"timing": TIMING, "vibration": vibration, "method": method, "check": False, **options}
+    common = {"timing": TIMING, "vibration": vibration, "method": method, "check": False}
     whole = restore(stack, **common)
-    torch.testing.assert_close(restore(stack, **common, **chunks), whole, rtol=0, atol=2e-7)
     three = torch.stack([stack] * 3, 1)  # channels have one noise level
     torch.testing.assert_close(restore(three, **common)[:, 1], whole)
 

@@ -32,7 +32,13 @@ from rsvib_torch.restoration.exact.filling import (
 from rsvib_torch.restoration.exact.finer_scene import FrameDifference, finer_scene, warn_of_frames
 from rsvib_torch.restoration.exact.mosaic_scene import restore_mosaic
 from rsvib_torch.restoration.exact.priors import PRIORS, check_prior
-from rsvib_torch.restoration.exact.scene_solver import MIN_LEVEL, MOST_THREADS, Partition, SceneProblem
+from rsvib_torch.restoration.exact.scene_solver import (
+    MIN_LEVEL,
+    MOST_THREADS,
+    SceneProblem,
+    most_values,
+    solver_threads,
+)
 from rsvib_torch.restoration.frame_motion import MovingFrames, joint_groups
 from rsvib_torch.restoration.noise import noise_levels
 from rsvib_torch.restoration.scene_model.cross_validation import prior_strengths
@@ -201,7 +207,7 @@ class FrameModel(MovingFrames):
         kinds = np.where(moved | incomplete, "pixels", np.where(ends, "extension", "nothing"))
         return [kind + (" and ends" if kind == "pixels" and end else "") for kind, end in zip(kinds, ends, strict=True)]
 
-    def problem(self, scenes: Scenes, kind: str, partition: Partition) -> SceneProblem:
+    def problem(self, scenes: Scenes, kind: str) -> SceneProblem:
         """The least-squares problem of scenes of one kind, with its missing values filled."""
         index = self._indices(scenes)
         stack_of, width = index[0][:, 0], self.images.shape[-1]
@@ -221,7 +227,7 @@ class FrameModel(MovingFrames):
         else:
             polynomial = self.prior[int(scenes.stack[0])]
             precision = polynomial.precision(level[0].square(), float(scenes.strength[0]), kernels.blur_reach)
-        problem = SceneProblem(data, observation, precision, level, partition)
+        problem = SceneProblem(data, observation, precision, level)
 
         # Values that are missing: the boundary extension of blurred rows, and pixels without data.
         if kind == "nothing":
@@ -281,7 +287,7 @@ def model_frames(given: MovingFrames, *, noise: float | Literal["auto"] = "auto"
 
 def solve_scenes(model: FrameModel, scenes: Scenes, options: ExactOptions) -> tuple[Tensor, list[FrameDifference]]:
     """Images (N, C, S H, S W) of scenes, and, on the finer grid, the differences of the frames of each scene."""
-    width, partition = model.images.shape[-1], Partition(options.chunk_frequencies, options.segments)
+    width = model.images.shape[-1]
     blocks = _blocks(model, scenes)
     found: dict[int, Tensor] = {}
     differences: list[FrameDifference] = []
@@ -291,7 +297,7 @@ def solve_scenes(model: FrameModel, scenes: Scenes, options: ExactOptions) -> tu
         """Solve the scenes of a block."""
         kind, numbers = block
         some = take_stacks([scenes], np.array(numbers))
-        problem = model.problem(some, kind, partition)
+        problem = model.problem(some, kind)
         if model.scale == 1:
             deviations = PRIORS[options.prior].function(problem, options.regularisation)
         else:
@@ -319,10 +325,10 @@ def _blocks(model: FrameModel, scenes: Scenes) -> list[tuple[str, list[int]]]:
     frequencies, rows = model.period // 2 + 1, height + 2 * SCENE_REACH
     across = math.ceil(float(model.motion.blur_lengths[..., 1].max()))
     systems = rows * (2 * (TAPS - 1 + across) + 1) * frequencies
-    most = Partition.most_values(rows, frequencies, device, blurred=False, single=False) // systems
+    most = most_values(rows, frequencies, device, blurred=False, single=False) // systems
     scene_bytes = 4 * scenes.members.shape[1] * model.images.shape[2] * height * model.period
     most = max(1, min(most, at_once(scene_bytes, device, cpu_bytes=_FRAME_BYTES)))
-    threads = Partition.threads(device)
+    threads = solver_threads(device)
     return [
         (kind, numbers[part])
         for kind, numbers in of_kind.items()

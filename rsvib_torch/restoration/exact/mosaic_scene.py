@@ -16,7 +16,7 @@ from rsvib_torch.options import ExactOptions
 from rsvib_torch.restoration.exact.filling import measured_values, scene_period
 from rsvib_torch.restoration.exact.finer_scene import phase_spread
 from rsvib_torch.restoration.exact.priors import check_prior
-from rsvib_torch.restoration.exact.scene_solver import MIN_LEVEL, Partition, SceneSolver
+from rsvib_torch.restoration.exact.scene_solver import MIN_LEVEL, SceneSolver
 from rsvib_torch.restoration.exact.similar_patches import similar_patches
 from rsvib_torch.restoration.frame_motion import FrameMotion, MovingFrames, joint_groups
 from rsvib_torch.restoration.noise import noise_levels
@@ -49,9 +49,7 @@ class MosaicSolver:
     ``precisions`` P_k are as from ``PolynomialPrior.precision``.
     """
 
-    def __init__(
-        self, observation: FinerObservation, weights: Tensor, precisions: list[Tensor], partition: Partition
-    ) -> None:
+    def __init__(self, observation: FinerObservation, weights: Tensor, precisions: list[Tensor]) -> None:
         self._observation, self._weights, self._precisions = observation, weights, precisions
         inside = (weights > 0).any(1, keepdim=True)
         self._inside = inside.to(weights.dtype)
@@ -60,8 +58,8 @@ class MosaicSolver:
         self._solvers = []
         for density, precision in zip(self._density.tolist(), precisions, strict=True):
             part = observation.weighted(density * observation.kernels.weight)
-            solver = SceneSolver(part, precision, partition)
-            self._solvers.append(solver if solver.interpolates else SceneSolver(part, precision, partition, keep=True))
+            solver = SceneSolver(part, precision)
+            self._solvers.append(solver if solver.interpolates else SceneSolver(part, precision, keep=True))
 
     def predict(self, coefficients: Tensor) -> Tensor:
         """Colours (M, 3, R, L) of noiseless frames of a scene with coefficients (K, 3, U)."""
@@ -202,7 +200,7 @@ class _Frames:
         """
         # 1. Deviations from the mean, extended to the period, and the weights of the measured and of the filled values.
         count, width, level = len(self.images), self.images.shape[-1], self.level
-        scale, partition = options.scale, Partition(options.chunk_frequencies, options.segments)
+        scale = options.scale
         mean = self.images.mean((0, 2, 3))[:, None, None]
         data = extend_rows(self.images - mean, self.length)
         inside = measured_values(along[None], None, data[None].shape, width, ends=True)[0]
@@ -213,7 +211,7 @@ class _Frames:
         def solver(strength: float) -> MosaicSolver:
             weights = measured.to(data.dtype).masked_fill(filled, _FILLED)
             precisions = self._precisions(full - mean, observation, level, strength)
-            return MosaicSolver(observation, weights, precisions, partition)
+            return MosaicSolver(observation, weights, precisions)
 
         # 2. Fit twice, with priors fitted to predicted instead of interpolated colours: 1 to 3 dB for eight frames. The
         # interpolated ones lack detail, so that their prior is too strong: 0.01 instead of 1 gains 2 to 3 dB for eight

@@ -56,84 +56,53 @@ def join_windows(values: Tensor, windows: list[slice]) -> Tensor:
     return torch.cat([values[a - w.start : b - w.start, ..., k, :] for k, (w, (a, b)) in enumerate(parts)])
 
 
-@dataclass(frozen=True)
-class Partition:
-    """Which parts of the systems of a scene are solved at a time."""
+def solver_threads(device: torch.device) -> int:
+    """Chunks of frequencies that are solved side by side."""
+    return min(allowed_threads(), MOST_THREADS) if device.type == "cpu" else 1
 
-    chunk: int | None = None  # frequencies solved at a time; None: chosen by memory
-    # number of windows of rows; None: as many as make a step of the elimination worth its call
-    segments: int | None = None
 
-    @staticmethod
-    def threads(device: torch.device) -> int:
-        """Chunks that are solved side by side."""
-        return min(allowed_threads(), MOST_THREADS) if device.type == "cpu" else 1
+def most_values(rows: int, frequencies: int, device: torch.device, *, blurred: bool, single: bool) -> int:
+    """Values of the bands in memory at a time: 128 MB on a CPU, 2 GB on a GPU, for several scenes.
 
-    @staticmethod
-    def most_values(rows: int, frequencies: int, device: torch.device, *, blurred: bool, single: bool) -> int:
-        """Values of the bands in memory at a time: 128 MB on a CPU, 2 GB on a GPU, for several scenes.
-
-        A single scene takes 32 MB, or 4 times the memory of its spectrum, for each of two chunks at a time on a CPU, so
-        that results do not depend on the number of threads. Where exposures blur, the rows are not divided, and a step
-        of the elimination has fewer values: twice the memory saves 18 % of the time for 1024 and 2048 rows.
-        """
-        if device.type == "cpu":
-            values = max(1 << 22, 4 * rows * frequencies) if single else 1 << 24
-        else:
-            values = max(1 << 28, 8 * rows * frequencies)
-        return 2 * values if blurred else values
-
-    def divide(
-        self,
-        rows: int,
-        width: int,
-        frequencies: int,
-        device: torch.device,
-        *,
-        blurred: bool,
-        keep: bool,
-        num_scenes: int = 1,
-    ) -> tuple[list[slice], list[slice]]:
-        """Chunks of the frequencies, and windows of the rows of scenes with a band of half-width ``width``.
-
-        Where exposures blur, frequencies that many neighbouring rows do not observe depend on distant rows, and the
-        rows are not divided. ``keep`` states that the factors of all frequencies are kept.
-        """
-        values = self.most_values(rows, frequencies, device, blurred=blurred, single=num_scenes == 1)
-        most = frequencies if keep else max(1, values // (num_scenes * rows * (2 * width + 1)))
-        rounds = -(-frequencies // most)
-        chunk = self.chunk or -(-frequencies // (8 * rounds)) * 8  # rows begin at full cache lines
-        chunk = min(chunk, frequencies)
-        if blurred:
-            return runs(frequencies, chunk), [slice(0, rows)]
-        # rows of a window, of which the overlap is a part: twice as fast as one window for 2048 rows, because a step of
-        # the elimination then has more values than its call from Python costs
-        count = self.segments or max(1, rows // (512 if device.type == "cpu" else 256))
-        return runs(frequencies, chunk), row_windows(rows, count)
+    A single scene takes 32 MB, or 4 times the memory of its spectrum, for each of two chunks at a time on a CPU, so
+    that results do not depend on the number of threads. Where exposures blur, the rows are not divided, and a step of
+    the elimination has fewer values: twice the memory saves 18 % of the time for 1024 and 2048 rows.
+    """
+    if device.type == "cpu":
+        values = max(1 << 22, 4 * rows * frequencies) if single else 1 << 24
+    else:
+        values = max(1 << 28, 8 * rows * frequencies)
+    return 2 * values if blurred else values
 
 
 class SceneSolver:
     """Solver of the normal equations of N scenes; ``keep`` keeps the factors, for solving several times.
 
     The ``precision`` P are products (p + 1, p + 1, N, U) as from ``RowPrior.precision``, in units of the noise of
-    weight 1. ``parts`` are the frequencies that are solved at a time.
+    weight 1.
+
+    A few frequencies are solved at a time, which bounds the memory, and windows of the rows side by side. Where
+    exposures blur, frequencies that many neighbouring rows do not observe depend on distant rows, and the rows are not
+    divided.
     """
 
-    def __init__(
-        self, observation: Observation, precision: Tensor, partition: Partition, *, keep: bool = False
-    ) -> None:
+    def __init__(self, observation: Observation, precision: Tensor, *, keep: bool = False) -> None:
         self.observation, self.precision, self.u = observation, precision, observation.u
         normal = observation.normal(len(precision) - 1)
+        rows, frequencies, device = observation.count, len(self.u), precision.device
+        blurred, scenes = observation.kernels.blurred, observation.num_scenes
 
-        self.parts, self._windows = partition.divide(
-            observation.count,
-            normal.width,
-            len(self.u),
-            precision.device,
-            blurred=observation.kernels.blurred,
-            keep=keep,
-            num_scenes=observation.num_scenes,
-        )
+        # Chunks of the frequencies; all at a time if their factors are kept.
+        values = most_values(rows, frequencies, device, blurred=blurred, single=scenes == 1)
+        most = frequencies if keep else max(1, values // (scenes * rows * (2 * normal.width + 1)))
+        rounds = -(-frequencies // most)
+        chunk = -(-frequencies // (8 * rounds)) * 8  # rows begin at full cache lines
+        self._parts = runs(frequencies, min(chunk, frequencies))
+
+        # Rows of a window, of which the overlap is a part: twice as fast as one window for 2048 rows, because a step of
+        # the elimination then has more values than its call from Python costs.
+        count = 1 if blurred else max(1, rows // (512 if device.type == "cpu" else 256))
+        self._windows = row_windows(rows, count)
         self._normal = normal.in_windows(self._windows)
         self._keep, self._num_rows = keep, self._windows[0].stop - self._windows[0].start
         self._interpolated: InterpolatedFactors | None = None
@@ -150,7 +119,7 @@ class SceneSolver:
     @cached_property
     def _factors(self) -> list[BandedFactor]:
         """Factors of all parts, where they are kept."""
-        return [factor_banded(self._normal.at(self.u[p], self.precision[..., p]), self._num_rows) for p in self.parts]
+        return [factor_banded(self._normal.at(self.u[p], self.precision[..., p]), self._num_rows) for p in self._parts]
 
     def _nodes(self) -> Tensor | None:
         """Frequencies whose systems are factored; None: all.
@@ -184,7 +153,7 @@ class SceneSolver:
         scenes, windows = self.observation.num_scenes, self._windows
 
         def solve(number: int) -> Tensor:
-            part = self.parts[number]
+            part = self._parts[number]
             # windows of the rows, (R, C, N W S)
             whole = right_side(part)
             right = torch.stack([whole[window] for window in windows], dim=3).flatten(2)
@@ -199,19 +168,19 @@ class SceneSolver:
             return join_windows(solution.unflatten(-1, (scenes, len(windows), -1)), windows)
 
         if differentiates:
-            return torch.cat([solve(number) for number in range(len(self.parts))], dim=-1)
+            return torch.cat([solve(number) for number in range(len(self._parts))], dim=-1)
         channels = given.shape[-3 if given.ndim == 5 else 1]
         coefficients: Tensor = given.new_empty(self.observation.count, channels, scenes, len(self.u))
 
         def fill_part(number: int) -> None:
-            coefficients[..., self.parts[number]] = solve(number)
+            coefficients[..., self._parts[number]] = solve(number)
 
-        in_parallel(fill_part, range(len(self.parts)), given.device, at_most=MOST_THREADS)
+        in_parallel(fill_part, range(len(self._parts)), given.device, at_most=MOST_THREADS)
         return coefficients
 
     def predict(self, coefficients: Tensor) -> Tensor:
         """Noiseless frames (N, M, C, R, L) of the scenes, ``K c``."""
-        spectra = [self.observation.forward(coefficients[..., part], part) for part in self.parts]  # less memory
+        spectra = [self.observation.forward(coefficients[..., part], part) for part in self._parts]  # less memory
         return torch.fft.irfft(torch.cat(spectra, dim=-1), n=self.observation.period)
 
     def image(self, coefficients: Tensor) -> Tensor:
@@ -227,8 +196,7 @@ class SceneProblem:
     observation: Observation  # observation operator of the frames
     precision: Tensor  # precision of the row prior, products as from ``RowPrior.precision``
     level: Tensor  # (N,) standard deviation of the noise of data of weight 1
-    partition: Partition  # parts solved at a time
 
     def solver(self, *, keep: bool = False) -> SceneSolver:
         """The solver for complete data; ``keep`` its factors, for solving several times."""
-        return SceneSolver(self.observation, self.precision, self.partition, keep=keep)
+        return SceneSolver(self.observation, self.precision, keep=keep)
