@@ -235,11 +235,6 @@ class BandedOptions:
 
     half_rows: Count = 16
     """Half height of a slab, in rows."""
-    stride: Count = 2
-    """Central rows kept per slab: 2 takes half the time of 1 and costs 0.02 dB (paper camera, noise 0.003)."""
-    interpolation: Literal["linear", "cubic"] = "cubic"
-    """Interpolation in the PSF: ``"linear"`` is that of the paper (Eqs. 26-39, N_e samples), whose own blur is
-    deconvolved as well; ``"cubic"`` is a cubic B-spline across rows, exact along them."""
     noise_to_signal: NotNegative | Literal["auto"] = "auto"
     """Variance of the noise over that of the scene gradients; ``"auto"`` estimates it."""
 

@@ -187,7 +187,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
         result[f"register_bands {method}"] = call(rsv.register_bands, method=method)
     methods: dict[str, dict[str, Any]] = {
         "exact": {"joint": False, "prior": "gaussian", "noise": "auto", "regularisation": 1.0},
-        "banded": {"half_rows": 8, "stride": 8, "interpolation": "cubic", "noise_to_signal": "auto"},
+        "banded": {"half_rows": 8, "noise_to_signal": "auto"},
         "dewarp": {"vibration": detected},
         "richardson-lucy": {"joint": False, "iterations": 2},
     }
