@@ -178,16 +178,6 @@ class BandRegistrationOptions(BandOptions, InputOptions):
 
 
 @options
-class JointOptions:
-    """Frames that are restored together."""
-
-    joint: bool | Count = Field(default=False, json_schema_extra=COMMAND_LINE)
-    """``True``: one image from all frames, in the coordinates of the middle one (the time axis keeps length 1); a
-    number K: every frame from K neighbouring ones; ``False``: every frame from itself. With image motion, only what a
-    frame has in common with the restored one is used."""
-
-
-@options
 class OpticsOptions:
     """Transfer function of a lens and of square pixels, see ``Optics``."""
 
@@ -203,9 +193,13 @@ class OpticsOptions:
 
 
 @options
-class ExactOptions(JointOptions):
+class ExactOptions:
     """Options of method ``"exact"``."""
 
+    joint: bool | Count = Field(default=False, json_schema_extra=COMMAND_LINE)
+    """``True``: one image from all frames, in the coordinates of the middle one (the time axis keeps length 1); a
+    number K: every frame from K neighbouring ones; ``False``: every frame from itself. With image motion, only what a
+    frame has in common with the restored one is used."""
     prior: Annotated[PriorName, Extensible] = Field(default="gaussian", json_schema_extra=COMMAND_LINE)
     """``"gaussian"``: rows predict their neighbours, one fast solution; ``"edges"``: moreover, every patch of 8 x 8 px
     is a sum of few cosines, which separates edges and flat areas from noise; several times slower."""
@@ -245,7 +239,7 @@ class DewarpOptions:
 
 
 @options
-class RichardsonLucyOptions(JointOptions):
+class RichardsonLucyOptions:
     """Options of method ``"richardson-lucy"``."""
 
     # each takes the time of four blurs; noise is amplified long before 1000 (docs/method.md)
@@ -272,8 +266,7 @@ class RestorationOptions(ExactOptions, BandedOptions, DewarpOptions, RichardsonL
 
     method: RestorationName = Field(default="exact", json_schema_extra=COMMAND_LINE)
     """``"exact"``: all rows coupled, several frames jointly if requested; ``"banded"``: row by row within slabs (Sec.
-    3.2 of Liu et al. 2023); ``"dewarp"``: geometry only, fastest; ``"richardson-lucy"``: iterative, non-negative,
-    several frames jointly if requested."""
+    3.2 of Liu et al. 2023); ``"dewarp"``: geometry only, fastest; ``"richardson-lucy"``: iterative, non-negative."""
     saturation: Positive | Literal["auto"] | None = Field(default="auto", json_schema_extra=COMMAND_LINE)
     """Level from which pixels are saturated, in the unit of the frames; ``"auto"``: full scale for integer frames, none
     for floating-point frames, whose level is unknown; None for none."""

@@ -189,7 +189,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
         "exact": {"joint": False, "prior": "gaussian", "noise": "auto", "regularisation": 1.0},
         "banded": {"half_rows": 8, "noise_to_signal": "auto"},
         "dewarp": {"vibration": detected},
-        "richardson-lucy": {"joint": False, "iterations": 2},
+        "richardson-lucy": {"iterations": 2},
     }
     for method, chosen in methods.items():
         result[f"restore {method}"] = call(rsv.restore, method=method, check=method == "exact", **chosen)

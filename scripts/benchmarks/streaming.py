@@ -43,7 +43,6 @@ RESTORATIONS: list[dict[str, Any]] = [
     {"method": "exact", "joint": True},
     {"method": "exact", "prior": "edges"},
     {"method": "richardson-lucy"},
-    {"method": "richardson-lucy", "joint": 3},
 ]
 
 
