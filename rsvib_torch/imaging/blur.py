@@ -57,23 +57,6 @@ class RowPSF:
         x, y = (weights.sum(-2) * columns).sum(-1), (weights.sum(-1) * rows).sum(-1)
         return torch.stack([x, y], dim=-1) + self.first_tap
 
-    def dense(self) -> tuple[Tensor, tuple[int, int]]:
-        """All kernels on one common grid, to plot them or to convolve whole frames.
-
-        Returns:
-            Kernels (..., R, KH', KW') and the displacement (x, y) in px of tap [0, 0].
-        """
-        start = self.first_tap.flatten(0, -2).amin(0)
-        place = self.first_tap - start
-        reach = place.flatten(0, -2).amax(0)
-        height, width = (size + int(extra) for size, extra in zip(self.weights.shape[-2:], reach.flip(0), strict=True))
-        rows = place[..., 1, None] + torch.arange(self.weights.shape[-2], device=place.device)
-        columns = place[..., 0, None] + torch.arange(self.weights.shape[-1], device=place.device)
-        index = rows[..., :, None] * width + columns[..., None, :]
-        kernels = self.weights.new_zeros(*self.weights.shape[:-2], height * width)
-        kernels = kernels.scatter(-1, index.flatten(-2), self.weights.flatten(-2))
-        return kernels.unflatten(-1, (height, width)), (int(start[0]), int(start[1]))
-
 
 def _axis_weights(displacement: Tensor, degree: int) -> tuple[Tensor, Tensor]:
     """First tap (..., R) and spline weights (..., R, N, K) of displacements (..., R, N) along one axis."""
@@ -105,7 +88,6 @@ def row_psf(
     *,
     interpolation: Interpolation = "linear",
     quadrature: Quadrature = "midpoint",
-    num_nodes: int | None = None,
 ) -> RowPSF:
     """Point spread function of every row (Eqs. 25-39 of Liu et al. 2023 with the defaults).
 
@@ -118,8 +100,7 @@ def row_psf(
         starts: Exposure starts of the rows in seconds, (..., R); batch dimensions of the vibration lead.
         timing: The sensor.
         interpolation: ``"linear"`` (the paper) or ``"cubic"``.
-        quadrature: ``"midpoint"`` (the paper: N_e nodes) or ``"gauss"``.
-        num_nodes: Number of nodes; by default N_e, or what the motion requires for ``"gauss"``.
+        quadrature: ``"midpoint"`` (the paper: N_e nodes) or ``"gauss"``, with as many nodes as the motion requires.
 
     Returns:
         The kernels of all rows.
@@ -133,7 +114,7 @@ def row_psf(
     """
     if not starts.numel() or not bool(torch.isfinite(starts).all()):
         raise ValueError(f"starts must be finite times of at least one row (seconds), got shape {tuple(starts.shape)}")
-    displacement, node_weights = exposure_trajectory(vibration, starts, timing, quadrature, num_nodes)
+    displacement, node_weights = exposure_trajectory(vibration, starts, timing, quadrature)
     return trajectory_psf(displacement, node_weights, interpolation=interpolation)
 
 
@@ -198,9 +179,6 @@ def form_rows(
     transfer = row_transfer(taps, along, frequencies).to(spectra.dtype)
     # sum over the taps of each row
     return (spectra[..., source, :] * transfer).sum(-2)
-
-
-_EXTRA_STATE = ("degree", "frame_width", "origin", "scene_size")  # attributes in state_dict besides the buffers
 
 
 def _gather_index(psf: RowPSF, tap: int, scene_size: tuple[int, int], width: int, origin: tuple[int, int]) -> Tensor:
@@ -275,10 +253,6 @@ def blur_rows_adjoint(
     summed = zip(reversed(scene_shape[:-2]), reversed(lead), strict=False)
     if len(scene_shape) - 2 > len(lead) or any(one not in (1, many) for one, many in summed):
         raise ValueError(f"scene_shape {tuple(scene_shape)} does not broadcast to the frames {(*lead, *size)}")
-    if frames.device.type == "cpu":
-        scene_bytes = math.prod((*lead, *size)) * frames.element_size()
-        if scene_bytes > 10**7:  # reading the free memory takes 0.5 ms, which would matter for small images
-            check_fits(f"scenes {(*lead, *size)}", 2 * scene_bytes, "check scene_shape")
     flat = frames.new_zeros(*lead, math.prod(size))
     num_rows, kernel_height, kernel_width = weights.shape[-3:]
     for tap in range(kernel_height):
@@ -358,12 +332,3 @@ class RowVaryingBlur(nn.Module):
         check_images({"y": y}, {"y": "... R W"})
         size = (y.shape[-2], y.shape[-1]) if self.scene_size is None else self.scene_size
         return self.adjoint(y, (*y.shape[:-2], *size))
-
-    def get_extra_state(self) -> dict[str, object]:
-        """Attributes that define the kernels, for ``state_dict``."""
-        return {name: getattr(self, name) for name in _EXTRA_STATE}
-
-    def set_extra_state(self, state: dict[str, object]) -> None:
-        """Restore the attributes of ``get_extra_state``."""
-        for name in _EXTRA_STATE:
-            setattr(self, name, state[name])

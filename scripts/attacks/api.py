@@ -168,7 +168,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
         "read_manifest": {"path": folder / "out.npy.manifest.json"},
         "read_motion": {"path": motion_file, "unit": "rad", "focal_length": 100.0},
         "read_vibration": {"path": folder / "vibration.json"},
-        "row_psf": {"starts": timing.row_starts(1, 96)[0], "num_nodes": 4},
+        "row_psf": {"starts": timing.row_starts(1, 96)[0]},
         "save_figure": {"path": new["figure.png"], "dpi": 20},
         "simulate_frames": {"frame_size": (64, 48), "num_frames": 2, "generator": generator},
         "ssim": {"image": restored, "reference": frames},

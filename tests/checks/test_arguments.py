@@ -150,7 +150,6 @@ def test_pixels_beyond_all_scales(value):
         (lambda: simulate(FRAMES[0] * 1e38, noise=rsv.SensorNoise(5000.0)), r"scene reach .*, at most 1e\+15"),
         (lambda: rsv.StackInfo(torch.zeros(3), "uint8", 255.0), r"shape\[0\] must be a whole number, got 0.0"),
         (lambda: blur().adjoint(FRAMES[0, 0], (96, 64)), r"frames must have shape \(..., R, W\)"),
-        (lambda: blur().adjoint(FRAMES[0], (10**6, 10**6)), r"scenes \(1000000, 1000000\) need .* check scene_shape"),
         (lambda: rsv.visible_pixels(TIMING, VIBRATION, (96, 64), 10**9), "masks of num_frames=1000000000 .* fewer"),
         (lambda: rsv.Vibration.still((10**4, 10**4)), "batch_shape must have at most 1000000 motions"),
         (lambda: blur().A_adjoint(torch.tensor(1.0)), r"y must have shape \(..., R, W\)"),
