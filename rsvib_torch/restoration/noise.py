@@ -1,14 +1,14 @@
 """Noise level of every frame of a stack: three estimators, and the order in which they are preferred.
 
 ``noise_levels`` (at the end of the file) is the entry. ``estimate_noise`` measures single images and counts fine
-texture as noise; the estimators of the table ``ESTIMATORS`` separate noise from texture by a second frame, or by the
-floor of the power spectrum.
+texture as noise; the other estimators separate noise from texture by a second frame, or by the floor of the power
+spectrum.
 
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from statistics import NormalDist
 
 import numpy as np
@@ -133,8 +133,8 @@ def noise_of_frame_pair(frames: Tensor, motion: FrameMotion, ignore: Tensor | No
 
     The least-squares scene of both frames leaves a residual without texture. What texture adds to ``high_pass`` is
     measured as the difference between that estimate and the residual, and assumed equal in all frames. NaN for stacks
-    in which fewer than two frames have content, or too many of the compared pixels are missing. Arguments as above
-    ``ESTIMATORS``.
+    in which fewer than two frames have content, or too many of the compared pixels are missing. Frames (B, T, C, H, W)
+    have local means at pixels to ``ignore``, and ``high_pass`` is NaN for frames without content.
     """
     result = torch.full_like(high_pass, math.nan)
     size = frames.shape[-2], frames.shape[-1]
@@ -222,11 +222,8 @@ def _pooled(values: Tensor) -> Tensor:
     return inner.unflatten(-2, (-1, 2)).unflatten(-1, (-1, 2)).mean((-3, -1))
 
 
-def noise_of_spectral_floor(frames: Tensor, motion: FrameMotion, ignore: Tensor | None, high_pass: Tensor) -> Tensor:
-    """Noise power (B, T) of each frame from ``noise_floor``; NaN if it is not clearly lower than ``high_pass``.
-
-    Arguments as above ``ESTIMATORS``.
-    """
+def noise_of_spectral_floor(frames: Tensor, ignore: Tensor | None, high_pass: Tensor) -> Tensor:
+    """Noise power (B, T) of each frame from ``noise_floor``; NaN if it is not clearly lower than ``high_pass``."""
     floor = noise_floor(frames, ignore).mean(-1).to(high_pass.dtype)
     # a noise level that is far too low amplifies noise more than one that is too high blurs
     bounded = torch.maximum(floor, high_pass / 9.0)
@@ -311,44 +308,24 @@ def _fit_floor(power: Tensor, frequency: Tensor, sector: Tensor) -> Tensor:
 
 # Choice of the estimator
 
-# Estimators that separate noise from texture, in order of preference. An estimator is called as
-#
-#     estimator(frames, motion, ignore, high_pass) -> Tensor
-#
-#     frames: (B, T, C, H, W) floating point in row order; ignored pixels hold local means.
-#     motion: FrameMotion of the B stacks.
-#     ignore: (B, T, C, H, W) bool, pixels that were not measured; None for none.
-#     high_pass: (B, T) noise power of ``estimate_noise``, texture included; NaN for a frame without content.
-#     returns: (B, T) noise power (variance per pixel in squared units of the frames); NaN for a frame that it cannot
-#         estimate, for all frames of a stack to which the estimator does not apply.
-#
-# It must not change its arguments, must not raise for small, constant or masked frames, and a stack must not affect
-# another one.
-Estimator = Callable[[Tensor, FrameMotion, Tensor | None, Tensor], Tensor]
-ESTIMATORS: dict[str, Estimator] = {"frame pair": noise_of_frame_pair, "spectral floor": noise_of_spectral_floor}
-
 
 @torch.no_grad()
 def noise_levels(frames: Tensor, motion: FrameMotion, ignore: Tensor | None = None) -> Tensor:
     """Standard deviation (B, T) of the noise of each frame of B stacks, in its unit; 0 without any content.
 
-    ``estimate_noise`` counts fine texture as noise, which makes it an upper bound; the first estimator of
-    ``ESTIMATORS`` that applies to a stack lowers it. A frame without content, or with too few measured pixels, has the
-    median noise power of the others. The frames (B, T, C, H, W) are in row order, with local means at pixels to
-    ``ignore``.
+    ``estimate_noise`` counts fine texture as noise, which makes it an upper bound; two frames of a stack lower it, or
+    else the spectral floor of each. A frame without content, or with too few measured pixels, has the median noise
+    power of the others. The frames (B, T, C, H, W) are in row order, with local means at pixels to ``ignore``.
     """
     alone = valid_mean(np.square(noise_deviation(frames, ignore)), -1)
     alone[_constant(frames)] = math.nan
     high_pass = torch.as_tensor(alone, dtype=frames.dtype, device=frames.device)
-    power, waiting = alone, np.full((len(alone), 1), True)
-    for estimator in ESTIMATORS.values():
-        estimated = table(estimator(frames, motion, ignore, high_pass))
-        applies = waiting & ~np.isnan(estimated).all(1, keepdims=True)
-        # a frame that the estimator cannot estimate keeps its power, NaN included
-        power = np.where(applies, np.minimum(alone, without_nan(estimated, math.inf)), power)
-        waiting &= ~applies
-        if not waiting.any():
-            break
+    estimated = table(noise_of_frame_pair(frames, motion, ignore, high_pass))
+    single = np.isnan(estimated).all(1, keepdims=True)
+    if single.any():
+        estimated = np.where(single, table(noise_of_spectral_floor(frames, ignore, high_pass)), estimated)
+    # a frame that neither can estimate keeps its upper bound, NaN included
+    power = np.minimum(alone, without_nan(estimated, math.inf))
     power = without_nan(np.where(np.isnan(power), median(power, 1, keepdims=True), power), 0.0)
     return torch.as_tensor(np.sqrt(power), dtype=frames.dtype, device=frames.device)
 
