@@ -25,7 +25,7 @@ TONES = torch.ones(2, 1, dtype=torch.float64)
 TIMES = torch.linspace(0, 0.1, 60, dtype=torch.float64)
 PAIR = torch.arange(2.0).reshape(1, 2)
 PSF = rsv.row_psf(STILL, TIMES[:8], TIMING)
-NOISE = rsv.SensorNoise(full_well=5000.0, read_noise=0.01, bits=12, column_offset=0.01, gain_spread=0.01)
+NOISE = rsv.SensorNoise(full_well=5000.0, read_noise=0.01, bits=12)
 REFUSED = rsv.detect_vibration(FRAMES[:1].repeat(2, 1, 1), TIMING)  # a camera at rest: no axis is restored
 MOTION = rsv.FreeMotion.through(TIMES, VIBRATION.displacement(TIMES))
 

@@ -1,4 +1,4 @@
-"""Optics in front of a sensor as a transfer function, and the noise and fixed pattern of the sensor."""
+"""Optics in front of a sensor as a transfer function, and the noise of the sensor."""
 
 import math
 from collections.abc import Callable
@@ -12,11 +12,10 @@ from torch import Tensor
 
 from rsvib_torch.checks.arguments import as_numbers, check_broadcast, check_images, check_pixels, checked_methods
 from rsvib_torch.checks.validation import NotNegative, Positive, options
-from rsvib_torch.checks.values import check_number, check_whole_number, described
+from rsvib_torch.checks.values import check_number, described
 from rsvib_torch.options import OpticsOptions
 
 _LEAST_RESPONSE = 0.1  # of the camera, below which the gain does not increase: 0.02 and 0.2 lose up to 5 and 3 dB
-Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
 @options
@@ -115,11 +114,9 @@ def _checked_mtf(mtf: object) -> tuple[tuple[float, ...], tuple[float, ...]]:
 @options
 @checked_methods
 class SensorNoise:
-    """Shot noise, read noise, fixed pattern and quantisation of a sensor whose full scale is 1.
+    """Shot noise, read noise and quantisation of a sensor whose full scale is 1.
 
-    A pixel with irradiance f has the value ``Poisson(F f (1 + p)) / F + c + r + read noise``, then quantised, with the
-    full well F, the gain error p of the pixel and the offsets c and r of its column and row: p, c and r are Gaussian,
-    drawn once from ``pattern_seed``, and the same in all frames.
+    A pixel with irradiance f has the value ``Poisson(F f) / F + read noise`` with the full well F, then quantised.
 
     Example:
         >>> SensorNoise(bits=1).apply(torch.tensor([[0.2, 0.7, 1.3]])).tolist()
@@ -136,56 +133,21 @@ class SensorNoise:
         default=None,
         description="Bits of the converter (values are then clipped to 0 ... 1); None for no quantisation.",
     )
-    gain_spread: Fraction = Field(
-        default=0.0,
-        description="Standard deviation of the gain of the pixels (photo response non-uniformity), as a fraction.",
-    )
-    column_offset: Fraction = Field(
-        default=0.0, description="Standard deviation of the offsets of the columns as a fraction of full scale."
-    )
-    row_offset: Fraction = Field(
-        default=0.0, description="Standard deviation of the offsets of the rows as a fraction of full scale."
-    )
-    pattern_seed: int = Field(
-        default=0, ge=0, le=2**63 - 1, description="Seed of the fixed pattern; each seed is another sensor."
-    )
-
-    def fixed_pattern(self, height: int, width: int) -> tuple[Tensor, Tensor]:
-        """Gain and offset of every pixel, float64 (height, width), the same in every call.
-
-        Args:
-            height: Rows of the sensor.
-            width: Columns of the sensor.
-        """
-        for name, size in (("height", height), ("width", width)):
-            check_whole_number(name, size, at_least=1, at_most=10**6)
-        generator = torch.Generator(device="cpu").manual_seed(self.pattern_seed)
-        columns, rows, pixels = (
-            torch.randn(shape, generator=generator, dtype=torch.float64, device="cpu")
-            for shape in ((1, width), (height, 1), (height, width))
-        )
-        return 1 + self.gain_spread * pixels, self.column_offset * columns + self.row_offset * rows
 
     def apply(self, frames: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Return noisy frames of the same shape and dtype.
 
         Args:
-            frames: Noise-free frames (..., H, W) of the whole sensor, full scale 1.
+            frames: Noise-free frames, full scale 1.
             generator: Source of randomness, on the device of the frames.
 
         Raises:
             ValueError: If a pixel is NaN or infinite.
         """
-        patterned = self.gain_spread > 0 or self.column_offset > 0 or self.row_offset > 0
-        check_images({"frames": frames}, {"frames": "... H W" if patterned else "..."})
+        check_images({"frames": frames}, {"frames": "..."})
         check_pixels("frames", frames)
-        if patterned:
-            gain, offset = (part.to(frames) for part in self.fixed_pattern(*frames.shape[-2:]))
-            frames = frames * gain
         if self.full_well is not None:
             frames = torch.poisson(frames.clamp(min=0.0) * self.full_well, generator=generator) / self.full_well
-        if patterned:
-            frames = frames + offset
         if self.read_noise > 0:
             noise = torch.randn(frames.shape, generator=generator, dtype=frames.dtype, device=frames.device)
             frames = frames + self.read_noise * noise

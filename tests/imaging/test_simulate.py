@@ -1,4 +1,4 @@
-"""Simulated frames against an independent camera; noise and fixed pattern of a sensor; transfer of the optics."""
+"""Simulated frames against an independent camera; noise of a sensor; transfer of the optics."""
 
 import math
 
@@ -82,43 +82,6 @@ def test_rows_showing_is_the_fixed_point():
     mean = vibration.mean_displacement(start + found * timing.row_time, timing.exposure_time)[..., 1]
     assert (found - rows - mean).abs().max() < 1e-6
     assert (found - rows).abs().max() > 0.6
-
-
-FLAT = torch.full((3, 300, 400), 0.5, dtype=torch.float64)
-
-
-def test_fixed_pattern_is_the_same_in_all_frames():
-    sensor = SensorNoise(gain_spread=0.01, column_offset=0.004, row_offset=0.002)
-    frames = sensor.apply(FLAT) - 0.5
-    assert torch.equal(frames[0], frames[2])
-    assert torch.equal(frames, sensor.apply(FLAT) - 0.5)
-    other = SensorNoise(gain_spread=0.01, column_offset=0.004, row_offset=0.002, pattern_seed=1).apply(FLAT) - 0.5
-    correlation = np.corrcoef(frames[0].flatten(), other[0].flatten())[0, 1]
-    assert abs(correlation) < 0.2
-
-
-def test_parts_of_the_pattern_have_their_standard_deviations():
-    gain = SensorNoise(gain_spread=0.01).apply(FLAT)[0] / 0.5 - 1
-    assert gain.std().item() == pytest.approx(0.01, rel=0.02)
-    assert gain.mean(0).std() < 0.002  # neither rows nor columns
-    columns = SensorNoise(column_offset=0.004).apply(FLAT)[0] - 0.5
-    assert columns.std(0).max() < 1e-12
-    assert columns[0].std().item() == pytest.approx(0.004, rel=0.1)
-    rows = SensorNoise(row_offset=0.004).apply(FLAT)[0] - 0.5
-    assert rows.std(1).max() < 1e-12
-    assert rows[:, 0].std().item() == pytest.approx(0.004, rel=0.1)
-    # gain scales with light, offsets do not
-    dark = SensorNoise(gain_spread=0.01, column_offset=0.004).apply(torch.zeros_like(FLAT))[0]
-    torch.testing.assert_close(dark, columns, rtol=0, atol=1e-12)
-
-
-def test_noise_is_added_to_the_pattern():
-    generator = torch.Generator().manual_seed(0)
-    sensor = SensorNoise(full_well=10000, read_noise=0.003, gain_spread=0.01, column_offset=0.004)
-    frames = sensor.apply(FLAT, generator)
-    moving = (frames[0] - frames[1]).var().item() / 2
-    assert moving == pytest.approx(0.5 / 10000 + 0.003**2, rel=0.02)
-    assert frames[0].var().item() == pytest.approx(moving + 0.005**2 + 0.004**2, rel=0.06)
 
 
 def test_a_wave_is_attenuated_by_the_transfer_function():
