@@ -111,7 +111,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     alignment = rsv.align_motion(frames, timing, recorded, offsets=(-0.001, 0.001), **BANDS)
     verdict = rsv.judge_restoration(frames, restored, timing, vibration)
     optics, sensor_noise = rsv.Optics(0.5, 0.4, 1.0), rsv.SensorNoise(5000.0, 0.01, 12, 0.01, 0.01, 0.01, 3)
-    calibration = rsv.RowTimeCalibration(1e-4, 1e-6, 12.0, 0.3, 1000.0, 104.0, "forward", 1e-3, 1e-5, ())
+    calibration = rsv.RowTimeCalibration(1e-4, 1e-6, 12.0, 0.3, 1000.0, 104.0, "forward", ())
     info = rsv.read_stack_info(stack)
     figure = rsv.motion_figure(vibration)
     tracker = rsv.VibrationTracker(rsv.SensorTiming(1e-4, 6, 104), window=2)
