@@ -17,6 +17,26 @@ def read(tmp_path, text):
     return read_config(tmp_path / "camera.toml")
 
 
+def test_the_timing_of_a_file_has_the_errors_of_its_sensor(tmp_path):
+    path = tmp_path / "camera.toml"
+    for text in (SENSOR, SENSOR + "[detection]\ntones = 2\n"):
+        path.write_text(text)
+        assert SensorTiming.from_file(path) == read_config(path).timing
+    for text in (
+        "",
+        "sensor = 3\n",
+        SENSOR.replace("frame_rows", "rows"),
+        SENSOR.replace("row_time = ", "row_time = -"),
+        "[",
+    ):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=r"camera\.toml") as of_timing:
+            SensorTiming.from_file(str(path))
+        with pytest.raises(ValueError, match=r"camera\.toml") as of_config:
+            read_config(path)
+        assert str(of_timing.value) == str(of_config.value)
+
+
 @pytest.mark.parametrize("name", ["iso12233", "in_orbit", "push_scan"])
 def test_shipped_configs_have_the_camera_of_the_paper(name):
     config = read_config(CONFIGS / f"{name}.toml")

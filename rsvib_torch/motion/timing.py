@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import itertools
 import math
+import os
 import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from rsvib_torch.checks.validation import Positive, options
+from rsvib_torch.checks.validation import Positive, options, validate
 from rsvib_torch.checks.values import check_choice, check_number, check_whole_number, described
-from rsvib_torch.files.reading import Table
+from rsvib_torch.files.reading import Table, read_toml
 
 if TYPE_CHECKING:
     import torch
@@ -156,6 +158,22 @@ class SensorTiming:
         period = 1 / check_number("frame_rate", frame_rate, above=0.0)
         others = scan_axis, readout_direction, frame_start_times, row_time_std
         return cls(row_time, exposure / row_time, period / row_time, *others)
+
+    @staticmethod
+    def from_file(path: str | os.PathLike[str]) -> SensorTiming:
+        """The timing in the table ``[sensor]`` of a configuration file, as ``rsvib init`` writes it.
+
+        Raises:
+            ValueError: If it is not TOML, or a key of ``[sensor]`` is missing, unknown or has a wrong type or value.
+
+        Example:
+            >>> SensorTiming.from_file("camera.toml").frame_rate  # doctest: +SKIP
+            29.97
+        """
+        data = read_toml(Path(path))
+        stated = {name: table for name, table in data.items() if name == "sensor"}
+        section: SensorSection = validate(_SensorFile, stated, str(path)).sensor
+        return section.to_timing()
 
     @property
     def exposure_time(self) -> float:
@@ -342,6 +360,11 @@ def _in_rows(name: str, value: float | None, converted: float | None, rows_name:
             "remove one of the two keys"
         )
     return rows
+
+
+@options
+class _SensorFile:
+    sensor: SensorSection
 
 
 @dataclass(frozen=True)

@@ -121,7 +121,7 @@ def test_init_takes_the_row_time_of_a_camera(place, capsys):
     assert "similar: Sony Xperia 1 V" in error
     assert rsvib("init", "clip.mp4", "--camera", "HERO5 Black", *options) == 0  # scaled from 1520 rows
     assert sensor()["row_time"] == pytest.approx(26.69e-3 / 1080, rel=1e-3)
-    timing = read_config("camera.toml").timing
+    timing = rsv.SensorTiming.from_file("camera.toml")
     assert timing.row_time_std == pytest.approx(0.03 * timing.row_time, rel=0.01)
     assert timing.to_dict()["row_time_std"] == timing.in_row_order().row_time_std == timing.row_time_std
     other = read_config("camera.toml", sensor={"row_time": 12e-6}).timing  # a row time of the command line is exact

@@ -11,7 +11,6 @@ from program import refused, rsvib
 from truth import MARGIN, Curve, Motion, crop, decibel, draw_scene, take_frames
 
 from rsvib_torch import SensorNoise, SensorTiming, StackInfo, Vibration, __version__, simulate_frames
-from rsvib_torch.config import read_config
 from rsvib_torch.io import read_stack, read_stack_info, write_stack
 
 AMPLITUDE, FREQUENCY, PHASE = (1.6, 1.1), (71.0, 113.0), (0.6, -1.2)
@@ -30,7 +29,7 @@ def make_place(tmp_path_factory):
     folder = tmp_path_factory.mktemp("camera")
     (folder / "camera.toml").write_text(CONFIG)
     write_stack(folder / "scene.png", draw_scene(368, 240, 11)[None], dtype="uint16", full_scale=65535)
-    scene, timing = read_stack(folder / "scene.png")[0], read_config(folder / "camera.toml").timing
+    scene, timing = read_stack(folder / "scene.png")[0], SensorTiming.from_file(folder / "camera.toml")
     noise, generator = SensorNoise(read_noise=0.003), torch.Generator().manual_seed(5)
     vibration = Vibration(AMPLITUDE, FREQUENCY, PHASE)
     frames = simulate_frames(scene, timing, vibration, 2, frame_size=(304, 176), noise=noise, generator=generator)
