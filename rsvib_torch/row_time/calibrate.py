@@ -113,6 +113,7 @@ def calibrate_row_time(
             black or saturated.
 
     Example:
+        >>> import torch
         >>> rows = torch.arange(512)
         >>> light = 0.4 + 0.2 * torch.cos(2 * torch.pi * rows / 64)
         >>> found = calibrate_row_time(light[None, :, None].expand(1, 512, 16), 1000.0)
