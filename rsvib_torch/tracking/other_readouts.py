@@ -140,6 +140,6 @@ def compared_readouts(fit: WindowFit, readout: float) -> WindowPath:
     if allowed > fit.unexplained or allowed > with_part(1.0, ROUNDS).unexplained:
         agreeing = [one for one in parts if left[one] < _AS_WELL * fit.unexplained and one > 0.0 and waves]
         return fit.path(agreeing=tuple(map(described, sorted(agreeing, key=lambda one: abs(math.log(one))))))
-    found = described(part).partition(" with")[0], math.sqrt(fit.unexplained), math.sqrt(other.unexplained)
+    found = described(part).partition(", with")[0], math.sqrt(fit.unexplained), math.sqrt(other.unexplained)
     # Rows that are read the other way, or all at once, are displaced along another path.
     return (other if part <= 0.0 else fit).path(found, is_of_other=part <= 0.0)
