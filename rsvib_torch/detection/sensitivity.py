@@ -14,7 +14,7 @@ from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.result import TimingSensitivity
 from rsvib_torch.detection.tones.fit import ToneFit, free_jacobian, model_displacements
 from rsvib_torch.motion.motion import Motion
-from rsvib_torch.motion.timing import RowTiming, SensorTiming
+from rsvib_torch.motion.timing import RowTiming, SensorTiming, other_intervals
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.numerics.tables import Array, pseudo_inverse, split_axis, table, tables, tensor
 from rsvib_torch.results.presentation import AXIS_NAMES
@@ -125,7 +125,7 @@ def assumptions(
             if num_frames == 2
             else f"{rate} frames/s; frequencies scale with it; a wrong {row} adds multiples of it"
         )
-    intervals = timing.other_intervals(timing.frame_starts(num_frames), num_rows)
+    intervals = other_intervals(timing, timing.frame_starts(num_frames), num_rows)
     if intervals is not None:
         apart = " to ".join(dict.fromkeys(f"{interval:.4g}" for interval in intervals))
         sentences.append(

@@ -253,6 +253,9 @@ def blur_rows_adjoint(
     summed = zip(reversed(scene_shape[:-2]), reversed(lead), strict=False)
     if len(scene_shape) - 2 > len(lead) or any(one not in (1, many) for one, many in summed):
         raise ValueError(f"scene_shape {tuple(scene_shape)} does not broadcast to the frames {(*lead, *size)}")
+    scene_bytes = math.prod((*lead, *size)) * frames.element_size()
+    if frames.device.type == "cpu" and scene_bytes > 10**7:  # to read the free memory takes 0.5 ms
+        check_fits(f"scenes {(*lead, *size)}", 2 * scene_bytes, "check scene_shape")
     flat = frames.new_zeros(*lead, math.prod(size))
     num_rows, kernel_height, kernel_width = weights.shape[-3:]
     for tap in range(kernel_height):

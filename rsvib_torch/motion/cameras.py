@@ -54,6 +54,10 @@ class CameraMode:
     readout_direction: str
     measured_rows: int
 
+    def __post_init__(self) -> None:
+        check_number("readout_time_std", self.readout_time_std)
+        check_whole_number("calibrations", self.calibrations, at_least=1)
+
     @property
     def name(self) -> str:
         """Brand, model and field of view."""

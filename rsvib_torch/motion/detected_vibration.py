@@ -6,7 +6,7 @@ from typing import ClassVar
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.checks.values import described
+from rsvib_torch.checks.values import check_whole_number, described
 from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.vibration import Vibration, VibrationStd, image_motion_line, tone_head, tone_places, tone_rows
 from rsvib_torch.results.presentation import (
@@ -153,7 +153,7 @@ class FollowedVibration(DetectedVibration, shapes={**DetectedVibration.shapes, "
 
     def with_tones(self, count: int) -> "FollowedVibration":
         """The same with ``count`` tones on each axis; those that it does not have are 0."""
-        missing = count - self.gain.shape[-1]
+        missing = check_whole_number("count", count, at_least=0, at_most=1000) - self.gain.shape[-1]
 
         def padded(values: Tensor) -> Tensor:
             return functional.pad(values, (0, missing)) if values.shape == self.gain.shape else values

@@ -231,31 +231,6 @@ class SensorTiming:
                 f"{self.frame_rate:g} frames/s, row_time is at most {self.frame_period / num_rows:.6g} s"
             )
 
-    def other_intervals(self, starts: Tensor, num_rows: int) -> tuple[float, float] | None:
-        """Shortest and longest interval in s between frames that are not 1 to 3 frame periods apart, to 1 %.
-
-        Otherwise None, also for more missing frames between others, and for line sensors: frames of the latter have no
-        blanking rows, and start after delays.
-        """
-        if len(starts) < 2 or self.frame_rows <= num_rows:
-            return None
-        periods = starts.diff() / self.frame_period
-        whole = periods.round().clamp(min=1.0)
-        if float(periods.min()) < 3.1 and bool(((periods - whole).abs() <= 0.01 * whole).all()):
-            return None
-        return float(periods.min()) * self.frame_period, float(periods.max()) * self.frame_period
-
-    def contradiction(self, starts: Tensor, num_rows: int) -> str:
-        """Sentence about starts of frames whose intervals are all far from the frame period; empty if they are not."""
-        least, most = self.other_intervals(starts, num_rows) or (self.frame_period, self.frame_period)
-        if 0.9 * least <= self.frame_period <= most / 0.9:
-            return ""
-        return (
-            f"by their times, frames are {float(starts.diff().median()):.3g} s apart, but the frame period is "
-            f"{self.frame_period:.3g} s (frame_rows={self.frame_rows:g} x row_time={self.row_time:g} s): wrong times "
-            "give wrong frequencies; times are seconds, correct them or frame_rows"
-        )
-
     def check_span(self, num_frames: int, num_rows: int) -> None:
         """Raise a ``ValueError`` if frames are too far apart for their number of rows to resolve frequencies.
 
@@ -266,7 +241,7 @@ class SensorTiming:
         starts = self.frame_starts(num_frames)
         step, span = float(starts.diff().median()), float(starts[-1] - starts[0])
         if span <= self.row_time * max(MAX_SPAN, _MAX_BLANKING * num_frames * num_rows):
-            text = self.contradiction(starts, num_rows)
+            text = contradiction(self, starts, num_rows)
             if text:
                 warnings.warn(text, TimingWarning, stacklevel=2)
             return
@@ -401,3 +376,30 @@ def row_axes(timing: SensorTiming, num_axes: int) -> tuple[list[int], list[float
     order = [1, 0, 2, 3] if transposed else [0, 1, 2, 3]
     signs = [1.0, -1.0 if reverse else 1.0, -1.0 if transposed != reverse else 1.0, 1.0]
     return order[:num_axes], signs[:num_axes]
+
+
+def other_intervals(timing: SensorTiming | RowTiming, starts: Tensor, num_rows: int) -> tuple[float, float] | None:
+    """Shortest and longest interval in s between frames that are not 1 to 3 frame periods apart, to 1 %.
+
+    Otherwise None, also for more missing frames between others, and for line sensors: frames of the latter have no
+    blanking rows, and start after delays.
+    """
+    if len(starts) < 2 or timing.frame_rows <= num_rows:
+        return None
+    periods = starts.diff() / timing.frame_period
+    whole = periods.round().clamp(min=1.0)
+    if float(periods.min()) < 3.1 and bool(((periods - whole).abs() <= 0.01 * whole).all()):
+        return None
+    return float(periods.min()) * timing.frame_period, float(periods.max()) * timing.frame_period
+
+
+def contradiction(timing: SensorTiming | RowTiming, starts: Tensor, num_rows: int) -> str:
+    """Sentence about starts of frames whose intervals are all far from the frame period; empty if they are not."""
+    least, most = other_intervals(timing, starts, num_rows) or (timing.frame_period, timing.frame_period)
+    if 0.9 * least <= timing.frame_period <= most / 0.9:
+        return ""
+    return (
+        f"by their times, frames are {float(starts.diff().median()):.3g} s apart, but the frame period is "
+        f"{timing.frame_period:.3g} s (frame_rows={timing.frame_rows:g} x row_time={timing.row_time:g} s): wrong times "
+        "give wrong frequencies; times are seconds, correct them or frame_rows"
+    )

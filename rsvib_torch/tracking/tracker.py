@@ -51,7 +51,7 @@ from rsvib_torch.frames.grey import GreyFrames, without_mosaic
 from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.frames.pixels import detailed_parts
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
-from rsvib_torch.motion.timing import MAX_SPAN, SensorTiming, check_timing
+from rsvib_torch.motion.timing import MAX_SPAN, SensorTiming, check_timing, contradiction
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.numerics.tables import Array, table, tables, tensor
 from rsvib_torch.options import MAX_TONES, DetectionMethod, RegistrationOptions, TrackerOptions
@@ -249,7 +249,7 @@ class VibrationTracker:
                 state = state.without_track(str(error).partition("\n")[0])  # no argument is wrong: they were checked
         if not state.lost and (state.track is None or state.contradictions >= PATIENCE):
             starts = tensor(np.array([*(frame.time for frame in self._state.frames), time]))
-            state = replace(state, lost=self._rows.contradiction(starts, 0))
+            state = replace(state, lost=contradiction(self._rows, starts, 0))
 
         # 3. The result, moved to where the steady image is.
         tracked = self._result(prepared, state)
