@@ -177,16 +177,16 @@ def write_detection(
         reports.write_table(folder / "tones.csv", result, pixel_size=pixel_size)
         reports.write_offsets(folder / "offsets.csv", result)
         reports.save_figure(reports.offset_figure(result), folder / "offsets.png")
-    names = ["offsets.png", "vibration.json", "tones.csv", "offsets.csv"]
+    names = ["vibration.json", "tones.csv", "offsets.csv"]
     with working("computing the spectrum"):
         try:
             spectrum = result.spectrum()
         except ValueError as error:  # few rows were measured; the frames are restored all the same
             warn(f"the spectrum is not written: {error}")
-            return names
+            return ["offsets.png", *names]
         reports.write_table(folder / "spectrum.csv", spectrum, pixel_size=pixel_size)
         reports.save_figure(spectrum.plot(), folder / "spectrum.png")
-    return [*names, "spectrum.png", "spectrum.csv"]
+    return ["offsets.png", "spectrum.png", *names, "spectrum.csv"]
 
 
 def write_windows(folder: Path, manifest: stacks.StackManifest, pixel_size: float | None = None) -> list[str]:
