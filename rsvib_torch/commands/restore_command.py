@@ -80,10 +80,8 @@ def restore(given: RestoreOptions) -> Answer:
     better than the input, the input is written unchanged. --force restores in both cases.
     """
     settings, frames, vibration = given.settings, given.frames, given.vibration
-    outputs, replaces = (
-        [*io.stack_files(given.restored), given.manifest],
-        given.overwrite or "resume" in given.processing,
-    )
+    outputs = [*io.stack_files(given.restored), given.manifest]
+    replaces = given.overwrite or "resume" in given.processing
     shared.check_new(outputs, replaces, [*given.inputs, vibration, given.motion, given.lens_profile])
     info, scale, chosen = given.planned_restoration(given.restoration)
     shape = info.restored_as(chosen.get("scale", 1), chosen.get("mosaic")).shape

@@ -46,7 +46,7 @@ class RunOptions(RestorationCommand, PixelSizeOptions, VerdictOptions):
     """Write a video: restored.mp4 (H.264) from .mp4, restored.mov from .mov, else restored.mkv (FFV1, without loss).
     Videos are followed frame by frame instead of in windows."""
     report: bool = False
-    """Write report.html as well: a page with all figures and the sharpness before and after, of the first window."""
+    """Write report.html as well: a page with all figures, of the first window."""
     moved: Annotated[
         Table,
         Given(
@@ -194,12 +194,13 @@ def _process_video(
     stored = stacks.read_manifest(manifest)
     bad = stored.bad_frames
     pairs = (number for number in range(info.shape[0] - 1) if str(number) not in bad and str(number + 1) not in bad)
-    first = min(pairs, key=lambda number: abs(number - 8))  # earlier frames must be decoded as well
-    before = read_frames(frames, (first, first + 1), stored.settings["full_scale"])
+    first = min(pairs, key=lambda number: abs(number - 8), default=None)  # earlier frames must be decoded as well
+    indices = () if first is None else (first, first + 1)  # no two neighbours could be used
+    before = read_frames(frames, indices, stored.settings["full_scale"])
     if stored.margins is not None:
         before = video.Margins(**stored.margins).cut(before)
-    after = read_frames(restored, (first, first + 1), None)
-    return result, _Shown(before, after, first, result.restored > 0, settings.timing, stored)
+    after = read_frames(restored, indices, None)
+    return result, _Shown(before, after, first or 0, result.restored > 0, settings.timing, stored)
 
 
 def _describe(folder: Path, given: RunOptions, result: stacks.StackReport, shown: _Shown, names: list[str]) -> Answer:

@@ -42,7 +42,10 @@ def read_frames(path: Path, indices: Sequence[int], full_scale: float | None) ->
     import numpy as np  # noqa: PLC0415
 
     with closing(io.open_stack(path)) as reader:
-        info, pixels = reader.info, np.stack([reader.frame(index) for index in indices])
+        info = reader.info
+        pixels = np.empty((len(indices), *info.shape[1:]), info.dtype)
+        for place, index in enumerate(indices):
+            pixels[place] = reader.frame(index)
     return io.counts_to_frames(pixels, full_scale or info.full_scale, str(path), info.nodata).nan_to_num(0.0)
 
 

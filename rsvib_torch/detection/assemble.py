@@ -58,7 +58,7 @@ def assembled(
     residual = (curve.offsets - predicted).abs().nanmean(dim=(1, 2))
     reliable = [[not of_axis for of_axis in of_stack] for of_stack in findings]
     # The axes of a stack have one timing, which the rows of one of them may contradict.
-    uncertain = [any(contradicted_axes(of_stack)) and not all(of_stack) for of_stack in findings]
+    contradicted = [any(contradicted_axes(of_stack)) and not all(of_stack) for of_stack in findings]
     stds = [
         of and with_row_time_std(scale.std(of).from_row_order(timing), vibration, sensitivity, timing)
         for of in (std, std_if_hidden_tone)
@@ -80,7 +80,7 @@ def assembled(
         reliable=magnitudes_from_row_order(torch.tensor(reliable, device="cpu"), timing),
         findings=tuple(findings_from_row_order(of_stack, timing) for of_stack in findings),
         sensitivity=sensitivity,
-        assumptions=assumptions(vibration, sensitivity, row_timing, num_frames, scale.height, blur, uncertain),
+        assumptions=assumptions(vibration, sensitivity, row_timing, num_frames, scale.height, blur, contradicted),
         timing=timing,
     ).to(curve.offsets.device)
 

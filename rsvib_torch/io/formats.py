@@ -41,7 +41,7 @@ _KEPT = ("full_scale", "frame_times", "orientation")
 _KEPT_BY_PNG = ("full_scale", "orientation")
 
 # The order is that of error messages.
-_FORMATS_OF_THE_PACKAGE = (
+_STACK_FORMATS = (
     StackFormat("npy", (".npy",), open_npy, write_npy, check=check_array),
     StackFormat("hdf5", (".h5", ".hdf5", ".hdf"), open_hdf5, write_hdf5, check=check_array, keeps=_KEPT),
     StackFormat("jpeg", (".jpg", ".jpeg"), open_images),
@@ -59,7 +59,7 @@ _FORMATS_OF_THE_PACKAGE = (
         "zarr", (".zarr",), open_zarr, write_zarr, check=check_array, kind="tree", marker="zarr.json", keeps=_KEPT
     ),
 )
-FORMATS: dict[str, StackFormat] = {ending: form for form in _FORMATS_OF_THE_PACKAGE for ending in form.endings}
+FORMATS: dict[str, StackFormat] = {ending: form for form in _STACK_FORMATS for ending in form.endings}
 """Format of every file ending."""
 
 

@@ -5,10 +5,11 @@ import difflib
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from importlib.resources import files
 
+from rsvib_torch.checks.validation import options
 from rsvib_torch.checks.values import check_number, check_whole_number, described
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.text import measured_text, number_of, quoted
@@ -20,7 +21,7 @@ _SAME_RATE = 0.03  # of the rate; 24 and 25 per second, which differ by 4 %, are
 _SAME_ASPECT = 0.01  # of the ratio of width and height; 2160 and 2176 rows of 3840 px are one mode
 
 
-@dataclass(frozen=True)
+@options
 class CameraMode:
     """Measured readout time of a camera model in one mode (https://github.com/gyroflow/lens_profiles).
 
@@ -53,10 +54,6 @@ class CameraMode:
     calibrations: int
     readout_direction: str
     measured_rows: int
-
-    def __post_init__(self) -> None:
-        check_number("readout_time_std", self.readout_time_std)
-        check_whole_number("calibrations", self.calibrations, at_least=1)
 
     @property
     def name(self) -> str:
@@ -111,9 +108,17 @@ def _modes() -> tuple[CameraMode, ...]:
     rows = csv.DictReader(line for line in text.splitlines() if not line.startswith("#"))
     return tuple(
         CameraMode(
-            *(row["brand"], row["model"], row["lens"], int(row["width"]), int(row["height"]), float(row["frame_rate"])),
-            *(1e-3 * float(row["readout_ms"]), 1e-3 * float(row["spread_ms"]), int(row["entries"]), row["direction"]),
-            int(row["height"]),
+            brand=row["brand"],
+            model=row["model"],
+            lens=row["lens"],
+            width=int(row["width"]),
+            height=int(row["height"]),
+            frame_rate=float(row["frame_rate"]),
+            readout_time=1e-3 * float(row["readout_ms"]),
+            readout_time_std=1e-3 * float(row["spread_ms"]),
+            calibrations=int(row["entries"]),
+            readout_direction=row["direction"],
+            measured_rows=int(row["height"]),
         )
         for row in rows
     )

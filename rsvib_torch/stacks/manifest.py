@@ -288,14 +288,13 @@ def _tones_over_windows(found: Sequence[DetectedVibration | None], axis: int) ->
 
 
 def fingerprint(path: Path) -> Table:
-    """Name, size and hash of a file, with ``NAME.json`` beside it, or of a folder.
+    """Name, size and hash of a file or folder.
 
     The hash covers the names and sizes of all files, and about 32 evenly spaced blocks of 64 KiB of about 32 of them:
     files of up to 2 MiB completely.
     """
     name, (path, _) = path.name, split_range(path)
-    members = path.rglob("*") if path.is_dir() else (path, path.with_name(f"{path.name}.json"))
-    files = sorted(file for file in members if file.is_file())
+    files = sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
     sizes = [file.stat().st_size for file in files]
     digest, block = hashlib.sha256(), 1 << 16
     for number, (file, size) in enumerate(zip(files, sizes, strict=True)):

@@ -25,7 +25,7 @@ from rsvib_torch.stacks.run_folder import RunFolder, StackReport, check_space, r
 from rsvib_torch.stacks.windows import Window
 
 _Result = TypeVar("_Result")
-_UNCOMPRESSED = ("npy", "hdf5", "raw", "tiff")  # formats whose files have the size of their pixels
+_UNCOMPRESSED = ("npy", "hdf5", "tiff")  # formats whose files have the size of their pixels
 _MAX_INITIAL_FAILURES = 8  # windows; a run stops if all windows up to this number fail
 
 
