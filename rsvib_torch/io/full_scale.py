@@ -47,7 +47,7 @@ def required_full_scale(full_scale: float | None, dtype: np.dtype, name: object)
 def full_scale_of_counts(counts: Array, full_scale: float | None, name: str) -> float:
     """As ``required_full_scale``; a ``ValueError`` as well if counts exceed the full scale."""
     full_scale = required_full_scale(full_scale, counts.dtype, name)
-    largest = int(counts.max())
+    largest = int(counts.max(initial=0))
     if largest > full_scale:
         raise ValueError(f"{name}: {beyond_full_scale(largest, full_scale)}")
     return full_scale
