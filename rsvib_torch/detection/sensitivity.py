@@ -154,6 +154,7 @@ def assumptions(
         effects = [text for name, change in of_stack for text in _effects(name, tones, change, timing)]
         if blur is not None:
             effects += _exposure_range(tones, timing, *blur[stack, :2].tolist())
+        effects += _tones_of_lamps(tones, amplitudes[stack], 0.1 / (num_frames * timing.frame_period))
         if any(contradicted[stack : stack + 1]):
             effects.append(
                 "readout direction, frame_rows and row_time: tones do not explain the other axis, as with a wrong "
@@ -164,6 +165,23 @@ def assumptions(
 
 
 _Tones = list[tuple[int, int, float]]  # axis, number and frequency in Hz of each tone
+
+
+def _tones_of_lamps(tones: _Tones, amplitudes: Array, tolerance: float) -> list[str]:
+    """Sentence about tones that lamps on mains of 50 or 60 Hz cause beside a tone of another frequency in Hz.
+
+    Their light of the frequency F weights the times within an exposure. The rows show the motion at the weighted middle
+    of the exposure, and a tone of the frequency f therefore also has the frequencies F + f and F - f. Of 11 reliable
+    axes under such lamps, 5 had these tones, with 0.2 to 4 % of the amplitude.
+    """
+    pairs = [(weak, strong) for weak in tones for strong in tones if weak[0] == strong[0]]
+    texts = [
+        f"{AXIS_NAMES[axis]} {weak:.4g} Hz ({lamp:g} {'+' if weak > lamp else '-'} {strong:.4g} Hz)"
+        for (axis, tone, weak), (_, other, strong) in pairs
+        for lamp in (100.0, 120.0)
+        if amplitudes[axis, tone] < 0.1 * amplitudes[axis, other] and abs(abs(weak - lamp) - strong) < tolerance
+    ]
+    return [f"steady light; a lamp that flickers also causes tones: {', '.join(texts)}"] if texts else []
 
 
 def _effects(name: str, tones: _Tones, changes: list[Array], timing: RowTiming) -> list[str]:

@@ -93,6 +93,18 @@ def test_roll_is_measured_by_default(rolling, detection):
     torch.testing.assert_close(found.vibration.amplitude, detection.vibration.amplitude, rtol=5e-3, atol=0)
 
 
+def test_roll_is_measured_by_default_where_detail_is_at_one_side():
+    """Rows are then displaced along y as well, and their quarters unevenly: roll was not tried."""
+    scene = draw_scene(304, 368, 12, blur=1.2)
+    at_the_left = 0.03 + 0.97 * np.exp(-np.square(np.arange(368) / (0.3 * 368)))
+    frames = take_field_frames(0.5 + (scene - 0.5) * at_the_left, TIMING, TRUTH, SIZE, 6)
+    noise = 0.002 * np.random.default_rng(5).standard_normal(frames.shape)
+    found = detect_vibration(torch.from_numpy(frames + noise).float(), TIMING)
+    assert found.reliable.tolist() == [True, True, True]
+    expected = TRUTH.vibration(3).amplitude
+    torch.testing.assert_close(found.vibration.amplitude, expected, rtol=0.01, atol=0)
+
+
 def test_without_roll_the_result_is_the_same():
     """Bit for bit: roll is measured only if the halves of the rows move apart."""
     scene = draw_scene(224, 224, 11, blur=1.2)

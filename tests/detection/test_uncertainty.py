@@ -9,6 +9,7 @@ import torch
 
 from rsvib_torch import (
     FreeMotion,
+    Vibration,
     VibrationTracker,
     detect_motion,
     detect_vibration,
@@ -221,6 +222,19 @@ def test_assumptions_state_what_the_frames_cannot_contradict():
     still = replace(vibration, frequency=0 * vibration.frequency)  # of a fit without meaning
     (of_still,) = assumptions(still, sensitivity, TIMING, 2, ROWS, np.array([[1.0, 0.5, 0.0]]))
     assert any("two frames" in text for text in of_still)
+
+
+@pytest.mark.parametrize(("lamp", "tones"), [(100, ["115 Hz (100 + 15 Hz)", "85 Hz (100 - 15 Hz)"]), (91, [])])
+def test_tones_beside_the_frequency_of_a_lamp_are_an_assumption(lamp, tones):
+    """A lamp on 50 Hz mains weights the times within an exposure 100 times per second."""
+    frequency = [[15.0, lamp + 15.0, lamp - 15.0], [40.0, 0.0, 0.0]]
+    motion = Vibration([[3.0, 0.1, 0.08], [2.0, 0.0, 0.0]], frequency, 0.4)
+    timing = SensorTiming(row_time=1 / 25 / 280, exposure_rows=30, frame_rows=280)
+    frames = simulate_frames(city_and_fields(300, 300, seed=3), timing, motion, num_frames=8)
+    found = detect_vibration(frames, timing)
+    assert found.reliable.all()
+    texts = [text for text in found.assumptions if text.startswith("steady light")]
+    assert [tone in texts[0] for tone in tones] == [True] * len(tones) if tones else not texts
 
 
 CAMERA = SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
