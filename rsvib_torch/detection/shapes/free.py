@@ -641,9 +641,9 @@ def _report(
     value, residual = motion.displacement(times), residual_of_motion(measured, motion)
     value = value - value.mean((0, 1))
     sudden = tensor(_sudden(measured, residual, table(times), motion.spacing))
-    std = torch.hypot(tensor(spread.of_rows), sudden)
-    std_seen = torch.hypot(tensor(spread.seen), sudden.square().mean((0, 1)).sqrt())
     unseen, rest = tensor(spread.unseen), tensor(measured.unexplained(residual)[0])
+    known = torch.hypot(tensor(spread.seen), sudden.square().mean((0, 1)).sqrt())
+    std, std_seen = torch.hypot(tensor(spread.of_rows), torch.hypot(sudden, rest)), torch.hypot(known, rest)
     # 2. The verdict.
     moved = (value - value.mean(0)).square().mean((0, 1)).sqrt()
     findings = []
@@ -654,8 +654,8 @@ def _report(
             against.insert(0, Reason("motion_unexplained", name, residual_of_axis, allowed))
         size = math.sqrt(2) * float(moved[axis] if scale.axes == 2 else moved[:2].amax())
         against += rotation_reasons(axis, scale.axes, apart.tolist(), size)
-        if float(std_seen[axis]) > _MAX_STD_SEEN:
-            against.append(Reason("motion_uncertain", name, float(std_seen[axis]), _MAX_STD_SEEN))
+        if float(known[axis]) > _MAX_STD_SEEN:
+            against.append(Reason("motion_uncertain", name, float(known[axis]), _MAX_STD_SEEN))
         limit = max(float(value[..., axis].square().mean().sqrt()), _MAX_STD_SEEN)  # of an axis that hardly moves
         if float(unseen[axis]) > limit:
             against.append(Reason("common_motion_uncertain", name, float(unseen[axis]), limit))
