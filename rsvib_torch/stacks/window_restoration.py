@@ -69,6 +69,7 @@ def restore_trusted(
     at most ``most_pairs`` are compared. They are returned as taken if nothing moves, or, without ``force``, if
     restoration makes them worse.
     """
+    vibration: Motion
     if isinstance(motion, MotionDetection):
         vibration, left_alone = reliable_motion(motion)
     else:

@@ -1,9 +1,9 @@
 """Stated standard deviations compared with errors and with the Cramér-Rao bound, on simulated recordings.
 
 Seeds follow from the version. Every recording has a scene, motion and noise of its own. Tones have 0.3 to 4 px and 0.3
-to 5 times the frame rate, exposures 1 to 200 rows of 2048; roll and zoom 0.2 to 2 px at half the width. Free
-motions are random walks, smooth motions, sums of three tones, single tones within 8 % of the frequency at which all
-frames have the same displacement, and tones that decay or sweep; the error is that of the part of the motion that differs
+to 5 times the frame rate, exposures 1 to 200 rows of 2048; roll and zoom 0.2 to 2 px at half the width. Free motions
+are random walks, smooth motions, sums of three tones, single tones within 8 % of the frequency at which all frames
+have the same displacement, and tones that decay or sweep; the error is that of the part of the motion that differs
 between frames, and of the whole motion. Row times from light have random row times and LED frequencies, in front of a
 plain wall, with 20 times the noise, of textured scenes in one frame, strong and weak, and in four frames.
 
