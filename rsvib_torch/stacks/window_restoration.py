@@ -155,7 +155,7 @@ def equivalent_tones(found: MotionDetection) -> DetectedVibration:
     window = torch.hann_window(_SAMPLES, dtype=torch.float64, device=times.device)[:, None]
     spectrum = torch.fft.rfft(window * moved, n=4 * _SAMPLES, dim=0)
     cycles = torch.fft.rfftfreq(4 * _SAMPLES, (last - first) / (_SAMPLES - 1), dtype=torch.float64, device=times.device)
-    largest = spectrum.abs().argmax(0, keepdim=True)
+    largest = 1 + spectrum[1:].abs().argmax(0, keepdim=True)
     frequency = cycles[largest].mT  # (A, 1)
     amplitude, phase = math.sqrt(2) * moved.square().mean(0)[:, None].sqrt(), spectrum.gather(0, largest).angle().mT
     vibration = Vibration(
