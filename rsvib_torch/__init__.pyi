@@ -46,7 +46,6 @@ from .motion.camera import Camera as Camera
 from .motion.cameras import CameraMode as CameraMode
 from .motion.cameras import camera_mode as camera_mode
 from .motion.cameras import find_cameras as find_cameras
-from .motion.detected_vibration import FollowedVibration as FollowedVibration
 from .motion.recorded import read_motion as read_motion
 from .motion.spline import FreeMotion as FreeMotion
 from .motion.timing import SensorTiming as SensorTiming
@@ -83,7 +82,6 @@ from .stacks import process_stack as process_stack
 from .stacks import read_manifest as read_manifest
 from .tracking import TrackedFrame as TrackedFrame
 from .tracking import VibrationTracker as VibrationTracker
-from .tracking import follow_vibration as follow_vibration
 from .video import process_video as process_video
 
 __version__: str

@@ -23,7 +23,7 @@ class Config:
     full_scale: float | None  # count that corresponds to 1.0 in integer frames; None if it is not in the file
     detection: Table  # options of ``detect_vibration`` that are in the file
     restoration: Table  # options of ``restore`` that are in the file
-    stack: Table  # options ``window`` and ``follow`` of ``process_stack`` that are in the file
+    stack: Table  # the option ``window`` of ``process_stack`` if it is in the file
     # options of the program that describe the camera, for the commands that it suggests
     arguments: tuple[str, ...] = ()
     path: Path | None = None  # the file; None if the camera is described by options only
@@ -48,7 +48,7 @@ def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, obj
       and ``frame_rows`` if they are known in seconds, and ``full_scale``.
     * ``[detection]``: options of ``detect_vibration``.
     * ``[restoration]``: options of ``restore``, with ``saturation`` in the unit of the frames' file.
-    * ``[stack]``: ``window`` and ``follow`` of ``process_stack``.
+    * ``[stack]``: ``window`` of ``process_stack``.
 
     Args:
         path: The TOML file; None if ``sensor`` describes the camera.

@@ -141,14 +141,6 @@ class VibrationOptions(ToneOptions, MaskedInputOptions):
 
 
 @options
-class FollowOptions(MaskedInputOptions):
-    """Options of ``follow_vibration``."""
-
-    columns: Columns | None = 384
-    """Columns that are measured, those with the most detail; None for all."""
-
-
-@options
 class FreeMotionOptions(ProjectionOptions, RegistrationOptions, MaskedInputOptions):
     """Options of ``detect_motion``; bands are those of the start."""
 
@@ -315,10 +307,6 @@ class WindowOptions:
 
     window: Frames = Field(default=8, json_schema_extra=COMMAND_LINE)
     """Largest number of frames in which one vibration is detected."""
-    follow: bool | Literal["auto"] = Field(default="auto", json_schema_extra=COMMAND_LINE)
-    """Follow the vibration from frame to frame in all windows (true) or none (false); by default where it changes, e.g.
-    decays (``"auto"``). These are windows in which no steady vibration explains the frames, if more axes are reliable
-    then; none with options of detection, ``joint``, ``scale``, ``mosaic`` or ``optics``."""
 
 
 @options
@@ -341,7 +329,8 @@ class StackDetectionOptions(WindowOptions, ResourceOptions):
     """Detection in windows."""
 
     detection: OptionTable = None
-    """Options of ``detect_vibration``; none with ``follow=True``."""
+    """Options of ``detect_vibration``. Without any, ``detect_motion`` measures windows in which no steady vibration
+    explains the frames, e.g. because it decays, if more axes are reliable then."""
 
 
 @options
@@ -349,8 +338,7 @@ class StackOptions(StackDetectionOptions):
     """Options of ``iterate_stack``."""
 
     restoration: OptionTable = None
-    """Options of ``restore``, for frames whose full scale is 1. With ``joint=True``, every window becomes one image.
-    With ``follow=True`` not ``joint``, ``scale``, ``mosaic`` or ``optics``."""
+    """Options of ``restore``, for frames whose full scale is 1. With ``joint=True``, every window becomes one image."""
     force: bool = False
     """Whether to keep restored frames even if they are judged worse than the raw ones."""
 

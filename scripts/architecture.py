@@ -18,7 +18,7 @@ LAYERS: tuple[dict[str, str], ...] = (
         "augmentation": "training data for Kornia pipelines",
         "datasets": "drawn scenes and example frames",
     },
-    {"tracking": "tracker.py: vibration frame by frame; following.py: through a stack; camera_path.py: path of a hand"},
+    {"tracking": "tracker.py: vibration frame by frame; camera_path.py: path of a hand"},
     {"gyroscope": "recorded motions: files, alignment of clock and axes with frames"},
     {
         "detection": "detect.py: frames → motion, standard deviations, verdict",

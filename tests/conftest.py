@@ -19,7 +19,7 @@ ALGORITHMS = ("detection", "registration", "restoration", "tracking", "test_impo
 RENDERED = {"report", "test_presentation.py", "test_docs.py", "test_spectrum.py"}  # tests of figures
 LONGEST = (
     "test_tutorials.py",
-    "test_followed_window.py",
+    "test_changing_vibration.py",
     "test_start.py",
     "test_process_video.py",
     "test_direct.py",

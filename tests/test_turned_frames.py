@@ -29,11 +29,6 @@ def free(frames, timing, _):
     return {"vector": found.displacement, "size": found.std}
 
 
-def followed(frames, timing, _):
-    found = rsv.follow_vibration(frames, timing)
-    return {"size": found.vibration.amplitude[..., 0], "image": rsv.restore(frames, timing, found, method="dewarp")}
-
-
 def tracked(frames, timing, _):
     tracker = rsv.VibrationTracker(timing, columns=None)
     *_, last = [tracker.update(frame) for frame in frames]
@@ -69,7 +64,6 @@ FUNCTIONS = {
     "detect_vibration": (lambda f, t, _: detected(f, t, "direct"), 3e-3, True),
     "detect_vibration, bands": (lambda f, t, _: detected(f, t, "bands"), 1e-3, True),
     "detect_motion": (free, 1e-3, True),
-    "follow_vibration": (followed, 1e-3, True),
     "tracker": (tracked, 1e-4, False),
     "judge_restoration": (judged, 1e-3, False),
     "align_motion": (aligned, 1e-3, False),

@@ -70,7 +70,8 @@ def windows_answer(
 ) -> Answer:
     """The vibration in the windows of a stack, and what was restored."""
     vibration, restoration = manifest.lines()
-    answer = Answer({title: vibration}, {"windows": manifest.totals()}, reliable=verdicts(manifest.detections()))
+    found = [record.detection for record in manifest.windows]
+    answer = Answer({title: vibration}, {"windows": manifest.totals()}, reliable=verdicts(found))
     if report is not None:
         answer.results["Restoration"] = [report.summary(), *restoration[1:]]
     return answer

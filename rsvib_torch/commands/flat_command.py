@@ -75,13 +75,11 @@ def _parameter(name: str, annotation: object, default: object, form: Table) -> i
     plain = [member for member in members if get_origin(member) is not Literal]
     kind: Any = str if str in plain else plain[0] if plain else type(choices[0])
     kind = Literal[choices] if not plain and kind is str else kind
-    automatic = kind is bool and choices == ("auto",)  # neither --name nor --no-name
     option_name = f"--{name.replace('_', '-')}"
-    switch = [f"{option_name}/--no-{option_name[2:]}" if automatic else option_name]
-    names = form.pop("names", ()) or (switch if kind is bool else [])
+    names = form.pop("names", ()) or ([option_name] if kind is bool else [])
     make: Callable[..., object] = typer.Argument if form.pop("positional", False) else typer.Option
     info = make(*names, help=form.pop("text"), **{"show_default": True} | form)
-    default = False if default is None and kind is bool and not automatic else default
+    default = False if default is None and kind is bool else default
     kind = Annotated[kind | None if default is None else kind, info]
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
 

@@ -134,7 +134,7 @@ class _Shown:
     was_restored: bool  # whether ``after`` is restored
     timing: rsvib_torch.SensorTiming
     stored: stacks.StackManifest  # all windows
-    detection: DetectionResult | None = None  # a vibration that was not followed
+    detection: DetectionResult | None = None  # of a steady vibration
     restoration: stacks.RestoredFrames | None = None  # its verdict
     options: Table = field(default_factory=dict)  # of ``restore``
 
@@ -149,8 +149,8 @@ def _process_windows(
 ) -> tuple[stacks.StackReport, _Shown]:
     """Process a stack in windows; the first one is shown."""
     settings, frames, processing = given.settings, given.frames, given.processing
-    common = common | {"window": chosen.window, "follow": chosen.follow, "force": given.force}
-    common["detection"] = None if chosen.follow is True else settings.detection  # a tracker has none
+    common = common | {"window": chosen.window, "force": given.force}
+    common["detection"] = settings.detection
     manifest, counts = given.out / "manifest.json", info.shape[0] > chosen.window
     of_run = common | processing | {"manifest": manifest}
     with working(f"restoring {frames.name}", counts=counts) as progress:
@@ -253,7 +253,7 @@ def _comparison(shown: _Shown) -> Figure:
 
 def _write_page(folder: Path, given: RunOptions, shown: _Shown, answer: Answer) -> list[str]:
     """Write the page, and return the names of its files."""
-    if not len(shown.after) or (shown.detection is None and not shown.stored.is_followed):
+    if not len(shown.after) or (shown.detection is None and not shown.stored.is_removed):
         warn("report.html is not written: the vibration of the first window is not known")
         return []
     judged = shown.restoration

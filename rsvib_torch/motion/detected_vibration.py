@@ -1,12 +1,11 @@
 """A detected vibration with its uncertainty and verdict: what restoration needs of a detection."""
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from typing import ClassVar
 
 from torch import Tensor
-from torch.nn import functional
 
-from rsvib_torch.checks.values import check_whole_number, described
+from rsvib_torch.checks.values import described
 from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.vibration import Vibration, VibrationStd, image_motion_line, tone_head, tone_places, tone_rows
 from rsvib_torch.results.presentation import (
@@ -135,35 +134,3 @@ class DetectedVibration(
     def _middle_time(self, batch: tuple[int, ...]) -> float | None:
         """Middle of the frames of a result in s; None without an offset curve."""
         return None
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class FollowedVibration(DetectedVibration, shapes={**DetectedVibration.shapes, "times": "..."}):
-    """The vibration at each frame of a stack, from ``follow_vibration``: a batch with one entry per frame.
-
-    Amplitude and frequency may change from frame to frame. A frame whose vibration is not known has amplitude 0, and is
-    not reliable. Phases and the image motion refer to the time origin of the stack, as those of all detections; their
-    values hold around the frame. ``restore`` restores each frame with its own entry.
-
-    Attributes:
-        times: (...) s, middle of the exposures of each frame.
-    """
-
-    times: Tensor = field(kw_only=True)
-
-    def with_tones(self, count: int) -> "FollowedVibration":
-        """The same with ``count`` tones on each axis; those that it does not have are 0."""
-        missing = check_whole_number("count", count, at_least=0, at_most=1000) - self.gain.shape[-1]
-
-        def padded(values: Tensor) -> Tensor:
-            return functional.pad(values, (0, missing)) if values.shape == self.gain.shape else values
-
-        vibration, std = self.vibration.mapped(padded), self.std.mapped(padded)
-        return replace(self, vibration=vibration, std=std, gain=padded(self.gain))
-
-    def timed_from(self, origin: float) -> "FollowedVibration":
-        """The same with another time origin, in s from the present one; times count from it as well."""
-        return replace(self, vibration=self.vibration.timed_from(origin), times=self.times - origin)
-
-    def _middle_time(self, batch: tuple[int, ...]) -> float | None:
-        return float(self.times[batch])

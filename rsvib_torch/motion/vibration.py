@@ -366,19 +366,6 @@ class Vibration(
         visible = self.amplitude > smallest[:, None]
         return torch.where(visible, self.frequency * duration, 0.0).amax(-1).detach()
 
-    def timed_from(self, origin: float | Tensor) -> Self:
-        """The same motion with another time origin, less the constant that the image motion adds to it.
-
-        The origin is in s from the present one: a number, or a tensor with one for each of a batch.
-        """
-        times = self.phase.new_tensor(origin) if isinstance(origin, float) else origin
-        phase = self.phase + 2 * math.pi * times[..., None, None] * self.frequency
-        return replace(
-            self,
-            phase=torch.remainder(phase + math.pi, 2 * math.pi) - math.pi,
-            image_motion=self.image_motion + times[..., None] * self.image_acceleration,
-        )
-
     def with_axes(self, order: Sequence[int], signs: Sequence[float]) -> Self:
         """The vibration whose component k is ``signs[k]`` times component ``order[k]``; amplitudes stay positive."""
         self._check_axes(order, signs)

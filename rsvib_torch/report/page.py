@@ -44,7 +44,7 @@ class Report:
     # frames after restoration, or one frame restored jointly from all, on a finer grid with as many times the rows and
     # columns; None if they were left unchanged
     restored: Tensor | None = None
-    # the detection (not a batch); None: the frames are those of a run that followed the vibration, with ``windows``
+    # the detection (not a batch); None: the frames are those of a run that measured another motion, with ``windows``
     detection: DetectionResult | None = None
     verdict: RestorationVerdict | None = None  # comparison of pairs of frames; None if they could not be compared
     windows: StackManifest | None = None  # windows of the stack that were processed separately; None if there are none
@@ -61,7 +61,7 @@ def headline(report: Report) -> tuple[str, str]:
     if result is None and unchanged:
         return "doubt", "No vibration was found that can be removed; the frames are unchanged."
     if result is None:
-        text = "The vibration was followed from frame to frame, and removed, by rsvib run; the page shows two frames."
+        text = "The vibration changes; it was measured and removed by rsvib run."
         return "good" if totals["outcomes"].get("helps") == totals["windows"] else "doubt", text
     outcome = "unknown" if report.verdict is None else report.verdict.overall
     cases = (
@@ -218,8 +218,8 @@ def write_report_page(folder: Path, report: Report) -> list[str]:
         removed = trusted_vibration(result, timing, count, num_rows)[0].to("cpu").translation()
         image_motion = removed.image_motion
     elif report.windows is not None:
-        followed = report.windows.followed()
-        image_motion = image_motion if followed is None else followed.vibration.image_motion[report.first]
+        motion = report.windows.windows[0].motion
+        image_motion = image_motion if motion is None else motion.tones.image_motion
     # an image that was restored jointly from all frames is compared with the one in the middle
     index = count // 2 if finer is not None and len(finer) < count else 0
     figures = [(name, text, figure_png(figure, dpi=140)) for name, text, figure in figures_of(report, index, removed)]

@@ -28,7 +28,7 @@ from rsvib_torch.files.atomic import whole_file
 from rsvib_torch.files.reading import Table
 from rsvib_torch.imaging import row_psf
 from rsvib_torch.imaging.trajectory import exposure_nodes
-from rsvib_torch.motion.detected_vibration import DetectedVibration, FollowedVibration
+from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
@@ -578,9 +578,6 @@ FIGURES.update(
     {
         (DetectionResult, 0): offset_figure,
         (DetectionResult, 1): _batch_figure,
-        (FollowedVibration, 1): lambda followed: windows_figure(
-            followed.times.tolist(), [followed[index] for index in range(len(followed.times))]
-        ),
         (detection.DisplacementSpectrum, 0): _spectrum_figure,
         (detection.MotionDetection, 0): _detected_motion_figure,
         (gyroscope.ClockAlignment, 0): lambda result: motion_figure(result.motion),
@@ -592,6 +589,8 @@ FIGURES.update(
         ),
         (OffsetCurve, 0): _measured_offsets_figure,
         (RestorationVerdict, 0): _verdict_figure,
-        (StackManifest, 0): lambda manifest: windows_figure(manifest.times(), manifest.detections()),
+        (StackManifest, 0): lambda manifest: windows_figure(
+            [record.start_time for record in manifest.windows], [record.detection for record in manifest.windows]
+        ),
     }
 )

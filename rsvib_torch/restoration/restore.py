@@ -1,7 +1,6 @@
 """Restoration of frames: input preparation, one of the methods, and a check of the result."""
 
 import math
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -14,10 +13,9 @@ from rsvib_torch.frames.mosaic import are_mosaics, interpolated_colours
 from rsvib_torch.frames.pixels import enlarged
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
 from rsvib_torch.imaging.sensor_model import Optics, sharpened
-from rsvib_torch.motion.detected_vibration import DetectedVibration, FollowedVibration
+from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.options import OpticsOptions, RestorationOptions, RestoreOptions, RestorerOptions
 from rsvib_torch.restoration.banded import restore_banded
 from rsvib_torch.restoration.dewarp import restore_dewarp
@@ -26,7 +24,6 @@ from rsvib_torch.restoration.frame_motion import (
     FrameMotion,
     Method,
     MovingFrames,
-    frame_motion,
     motion_of_frames,
     restore_in_strips,
 )
@@ -34,9 +31,7 @@ from rsvib_torch.restoration.restoration_warning import warn_of_restoration
 from rsvib_torch.restoration.richardson_lucy import restore_richardson_lucy
 from rsvib_torch.restoration.verdict.judge import judge_stacks
 from rsvib_torch.restoration.verdict.restoration_verdict import RestorationVerdict
-from rsvib_torch.restoration.verdict.trust import trusted_vibration, vibration_to_undo
-from rsvib_torch.results.presentation import AXIS_NAMES
-from rsvib_torch.results.reason import Reason
+from rsvib_torch.restoration.verdict.trust import vibration_to_undo
 
 # Restoration methods. A method is called as
 #
@@ -137,11 +132,6 @@ def restore(
         mosaic=options.mosaic,
     )
     warn_of_mosaic(prepared)
-    if isinstance(vibration, FollowedVibration):
-        result, _, left_alone = restore_each(prepared, vibration, options)
-        for reason in left_alone:
-            warn_of_restoration(str(reason))
-        return prepared.from_row_order(result)
     timing = prepared.image_timing
     _, count, _, height, _ = prepared.images.shape
     vibration, left_alone = vibration_to_undo(vibration, timing, count, height)
@@ -172,47 +162,6 @@ def _restored(frames: MovingFrames, options: RestorationOptions) -> Tensor:
     """Restored frames (B, T, C, H, W) by the method of the options."""
     with threads_for(frames.images):
         return restore_in_strips(METHODS[options.method], frames, options)
-
-
-@outside_graphs
-@full_precision
-def restore_each(
-    frames: PreparedFrames, followed: FollowedVibration, options: RestorationOptions
-) -> tuple[Tensor, Vibration, tuple[Reason, ...]]:
-    """Restore each frame with its own vibration.
-
-    The results are frames (B, T, C, H, W) in row order, as taken where no motion is known; the B T vibrations that were
-    undone, each with the time origin in the middle of its frame; a reason for each axis that was restored in no frame.
-    """
-    (stacks, count), height = frames.images.shape[:2], frames.images.shape[-2]
-    if tuple(followed.batch_shape) != ((stacks, count) if frames.batched else (count,)):
-        raise ValueError(
-            f"vibration was followed through {tuple(followed.batch_shape)} frames, but frames are {stacks} x {count}; "
-            "pass the frames that it was detected in"
-        )
-    if options.joint:
-        raise ValueError(f"joint={options.joint}: frames of a vibration that changes are restored one by one")
-    # 1. Each frame is a stack of one, with the time origin in its middle.
-    if frames.batched:
-        findings = tuple(one for stack in followed.findings for one in stack)
-        followed = replace(followed.mapped(lambda values: values.flatten(0, 1)), findings=findings)
-    vibration = followed.vibration.timed_from(followed.times)
-    timing = replace(frames.image_timing, frame_start_times=(-frames.timing.time_to_middle(height),))
-    trusted, left_alone = trusted_vibration(replace(followed, vibration=vibration), timing, 1, height)
-    axes = trusted.moving_axes()
-    # 2. Only frames that move are restored.
-    result = _as_taken(frames, False, options.scale)
-    moving = axes.any(-1)
-    if bool(moving.any()):
-        moved = trusted.mapped(lambda values: values[moving]).to_row_order(timing).to(result.device)
-        apart = MovingFrames.of(frames, frame_motion(moved, timing.in_row_order(), 1, height))
-        restored = _restored(apart.mapped(lambda values: values.flatten(0, 1)[moving][:, None]), options)[:, 0]
-        flat = result.flatten(0, 1)
-        flat[moving] = sharpened(restored, check_optics(options.optics), options.scale)
-        result = flat.unflatten(0, (stacks, count))
-    nowhere = [name for name, moves in zip(AXIS_NAMES, axes.any(0).tolist(), strict=False) if not moves]
-    first = {reason.axis: reason for reason in reversed(left_alone)}
-    return result, trusted, tuple(first[name] for name in nowhere if name in first)
 
 
 def unchanged_frames(frames: PreparedFrames, joint: bool | int, scale: int = 1) -> Tensor:

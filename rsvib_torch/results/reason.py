@@ -109,7 +109,6 @@ class Reason:
 _COMPARED = ("value", "limit")
 # What texts of Python name, and the same for users of the program
 _OPTIONS = {
-    "follow_vibration": "rsvib run --follow",
     "detect_motion": "rsvib motion",
     "check frame_rows, row_time": "check --frame-rate, --row-time",
     "check exposure_rows": "check --exposure",
@@ -154,8 +153,8 @@ def read_findings(values: object) -> Reason | Findings:
 
 _MORE_FRAMES = "use more frames"
 _MAY_BE_STILL = "the camera may stand still along this axis; use more frames if a vibration is expected"
-_FOLLOW = "use follow_vibration if the vibration changes"
-_TONES_OR_FREE = f"{_FOLLOW}, try more tones or detect_motion"
+_CHANGES = "detect_motion if the vibration changes"
+_TONES_OR_FREE = f"try more tones, or {_CHANGES}"
 _CHECK_TIMING = "and check frame_rows, row_time, exposure_rows and the start times of the frames"
 _UNCERTAIN = "the displacement of the rows is uncertain: {size:.2g} ± {value:.2g} px"
 
@@ -220,7 +219,7 @@ _TONES = {
     ),
     "displacement_ambiguous": _px(
         f"{_UNCERTAIN}, {{limit:.2g}} px are allowed, because the frames also agree with other tones",
-        f"{_FOLLOW}, or use more frames",
+        f"use {_CHANGES}, or more frames",
         "standard deviation of the displacement of the rows, above 4 % of it and 0.01 px, with several tones or if it "
         "exceeds 1.5 times the one of the fit alone",
     ),
@@ -293,25 +292,6 @@ _TONES = {
         "the frames agree with readout_direction='{agreeing}', not with '{stated}'"
     ),
     "other_scan_axis": _of_all_axes("the frames agree with scan_axis='{agreeing}', not with '{stated}'"),
-}
-_FOLLOWED = {
-    "not_followed": ReasonKind("the vibration is not known at this frame", _MORE_FRAMES),
-    "directions_differ": _px(
-        "forwards and backwards in time, the displacement of the rows differs by {value:.2g} px, {limit:.2g} px are "
-        "allowed",
-        "use more frames, or frames at shorter intervals",
-        "rms difference of the displacements that both trackers find, above 0.01 px, 3 % and 4 standard deviations",
-    ),
-    "tones_contradicted": ReasonKind(
-        "in {value:.0%} of the frames the rows contradict the tones, or tones are nearly blind; {limit:.0%} are "
-        "allowed",
-        "use more frames, or frames at shorter intervals",
-        "part of the frames with rows_unexplained, neighbours_unexplained, halves_apart, directions_differ, "
-        "not_followed or tone_blind, above 7 %",
-    ),
-    "other_tone": ReasonKind(
-        "a tone of {frequency:.4g} Hz explains the frames as well", "use more frames, or frames at other intervals"
-    ),
 }
 _SHAPES = {
     "frames_repeated": ReasonKind(
@@ -479,7 +459,6 @@ _RESTORATION = {
 # The codes by what they refuse; a code belongs to one group.
 GROUPS = {
     "Tones (`detect_vibration`)": _TONES,
-    "A vibration that is followed (`follow_vibration`)": _FOLLOWED,
     "Other motions (`detect_motion`)": _SHAPES,
     "Recorded motions (`align_motion`)": _RECORDED,
     "Row time (`calibrate_row_time_by_motion`)": _ROW_TIME,

@@ -2,11 +2,10 @@
 
 import os
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -14,8 +13,7 @@ from torch import Tensor
 
 from rsvib_torch.checks.arrays import PathLike
 from rsvib_torch.checks.values import check_choice
-from rsvib_torch.detection import detect_vibration
-from rsvib_torch.files.reading import Table
+from rsvib_torch.detection import MotionDetection, detect_motion, detect_vibration
 from rsvib_torch.frames.mosaic import check_mosaic, colour_frames
 from rsvib_torch.frames.pixels import enlarged
 from rsvib_torch.io import full_scale as scales
@@ -24,12 +22,11 @@ from rsvib_torch.io.frame_times import exposure_times, timing_of_stack
 from rsvib_torch.io.full_scale import counts_to_frames
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.io.stack_reading import open_stack, read_stack_info
-from rsvib_torch.motion.detected_vibration import DetectedVibration, FollowedVibration
+from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import (
-    OptionTable,
     ProcessStackOptions,
     RestorationOptions,
     StackDetectionOptions,
@@ -40,17 +37,19 @@ from rsvib_torch.restoration.restore import check_optics
 from rsvib_torch.results.presentation import Summarised, plain_values
 from rsvib_torch.stacks.memory import windows_at_once
 from rsvib_torch.stacks.window_restoration import (
-    MARGIN,
     RestoredFrames,
+    equivalent_tones,
     frame_fault,
     may_change,
-    restore_followed,
+    reliable_motion,
     restore_trusted,
     without_data,
 )
 from rsvib_torch.stacks.windows import Window, WindowRecord, cut_windows, window_timing
-from rsvib_torch.tracking.following import follow_vibration
 
+# Least number of knots of a motion in the rows of a frame. With 8, half of the axes of small frames (192 rows, one to
+# six periods in a frame) were refused, which are reliable with 16 and 24.
+_KNOTS = 16
 WindowFrames = list[Array | str]  # pixels as stored, or why a frame cannot be read
 
 
@@ -61,12 +60,12 @@ class WindowResult(Summarised):
     window: Window
     indices: tuple[int, ...]  # of ``frames`` in the stack; empty if all frames were restored jointly as one image
     frames: Tensor  # with full scale 1, (T, H, W) or (T, C, H, W): restored, or as taken
-    # with the time origin at the window's first frame; a ``FollowedVibration`` of the frames ``indices`` if it was
-    # followed from frame to frame; None if it failed
+    # with the time origin at the window's first frame; None if it failed. With a ``motion``, its ``equivalent_tones``
     detection: DetectedVibration | None
     restoration: RestoredFrames | None  # None without a detection
     error: str | None  # why detection or restoration failed
     bad_frames: Mapping[int, str]  # frames of ``window.written`` that could not be used; they are not in ``frames``
+    motion: FreeMotion | None = None  # of a vibration that changes, in place of tones; axes that are not reliable rest
 
     @property
     def restored(self) -> bool:
@@ -75,10 +74,8 @@ class WindowResult(Summarised):
 
     @property
     def changed(self) -> dict[int, Tensor]:
-        """The restored frames by index, without those that are as taken because their motion is unknown."""
-        as_taken = () if self.restoration is None else self.restoration.as_taken
-        frames = enumerate(zip(self.indices, self.frames, strict=True)) if self.restored else ()
-        return {index: frame for number, (index, frame) in frames if number not in as_taken}
+        """The restored frames by index."""
+        return dict(zip(self.indices, self.frames, strict=True)) if self.restored else {}
 
     def summary(self) -> str:
         """Frames of the window, its vibration, and what was restored."""
@@ -134,42 +131,39 @@ class StackJob:
 
     def compute(self, window: Window, pixels: WindowFrames) -> WindowResult:
         """Detect the vibration in a window, restore its frames and judge the result."""
-        # 1. The frames that can be used, of the window and around it.
+        # 1. The frames that can be used.
         options, read = self.options, dict(zip(window.frames, pixels, strict=True))
         found = ((index, frame_fault(read[index], index, options.full_scale, self.info.nodata)) for index in read)
         faults = {index: fault for index, fault in found if fault is not None}
         usable = {index: one for index, one in read.items() if index not in faults and not isinstance(one, str)}
-        inside = [index for index in usable if window.first <= index <= window.last]
-        kept = tuple(index for index in inside if index in window.written)
-        taken = self._images([usable[index] for index in inside])
+        kept = tuple(index for index in usable if index in window.written)
+        taken = self._images(list(usable.values()))
         bad = {index: fault for index, fault in faults.items() if index in window.written}
         result = WindowResult(window, kept, self._unchanged(taken[: len(kept)]), None, None, None, bad)
-        if faults and len(inside) < 2:
+        if faults and len(usable) < 2:
             return replace(result, error=next(iter(faults.values())))
-        timing = window_timing(self.timing, window, inside)
+        timing = window_timing(self.timing, window, list(usable))
         try:
             # 2. Their motion.
-            motion = self._motion(window, usable, taken, timing)
+            motion = self._motion(window, taken, timing)
             if motion is None:
                 return replace(result, error="no detection was given for this window")
             if isinstance(motion, DetectedVibration):
                 result = replace(result, detection=motion)
+            elif isinstance(motion, MotionDetection):
+                result = replace(result, detection=equivalent_tones(motion), motion=reliable_motion(motion)[0])
             if options.restoration is None:
                 return result
             # 3. The frames without it.
-            if isinstance(motion, FollowedVibration):
-                taken, timing = taken[: len(kept)], window_timing(self.timing, window, list(kept))
-                restoration = restore_followed(taken, timing, motion, self.chosen, force=options.force)
-            else:
-                restoration = restore_trusted(
-                    taken,
-                    timing,
-                    motion,
-                    self.chosen,
-                    force=options.force,
-                    first_frames=len(kept) if len(kept) > 1 and not self.chosen.joint else None,
-                    most_pairs=8 if window.alone else 2,  # limits the time of the verdict
-                )
+            restoration = restore_trusted(
+                taken,
+                timing,
+                motion,
+                self.chosen,
+                force=options.force,
+                first_frames=len(kept) if len(kept) > 1 and not self.chosen.joint else None,
+                most_pairs=8 if window.alone else 2,  # limits the time of the verdict
+            )
         except (ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
             return replace(result, error=" ".join(str(error).split()))
         result = replace(result, restoration=restoration)
@@ -183,27 +177,19 @@ class StackJob:
         return replace(result, frames=frames if self.info.nodata is None else without_data(frames, taken))
 
     def _motion(
-        self, window: Window, usable: Mapping[int, Array], taken: Tensor, timing: SensorTiming
-    ) -> DetectedVibration | FreeMotion | None:
-        """The motion in the frames ``taken`` of a window, or at each that it writes; None if it should be given."""
+        self, window: Window, taken: Tensor, timing: SensorTiming
+    ) -> DetectedVibration | MotionDetection | FreeMotion | None:
+        """The motion in the frames ``taken`` of a window; None if it should be given."""
         if self.given is not None:
             return self.given[window.index]
-        detected = None
-        if self.options.follow is not True:
-            detected = detect_vibration(taken, timing, **self.options.detection or {})
-            if self.options.follow is False or not may_change(detected, len(usable)):
-                return detected
-        try:
-            around = window_timing(self.timing, window, list(usable))
-            found = follow_vibration(self._images(list(usable.values())), around, channels="first")
-        except (ValueError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
-            if detected is None:
-                raise
+        detected = detect_vibration(taken, timing, **self.options.detection or {})
+        if self.options.detection or not may_change(detected, len(taken)):
             return detected
-        written = [found[number] for number, index in enumerate(usable) if index in window.written]
-        followed = FollowedVibration.stacked(written)
-        if detected is None or followed.reliable.double().mean(0).sum() > detected.reliable.sum():
-            return followed
+        with suppress(ValueError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
+            rows = taken.shape[int(timing.scan_axis)]
+            found = detect_motion(taken, timing, knot_rows=min(24, max(4, rows // _KNOTS)))
+            if found.reliable.sum() > detected.reliable.sum():
+                return found
         return detected
 
     def _images(self, frames: Sequence[Array]) -> Tensor:
@@ -244,7 +230,6 @@ class StackJob:
     def record(self, result: WindowResult, written: int) -> WindowRecord:
         """The record of a result of which ``written`` frames were written."""
         window, restoration = result.window, result.restoration
-        followed = result.indices if isinstance(result.detection, FollowedVibration) else None
         verdict = None if restoration is None else restoration.verdict
         return WindowRecord(
             window=window.index,
@@ -259,8 +244,7 @@ class StackJob:
             bad_frames={str(index): reason for index, reason in result.bad_frames.items()},
             left_alone=() if restoration is None else restoration.left_alone,
             error=result.error,
-            followed=followed,
-            restored_frames=None if followed is None else len(result.changed),
+            motion=None if result.motion is None else result.motion.to("cpu"),
         )
 
 
@@ -275,40 +259,11 @@ def stored_frame(read: Callable[[int], Array], index: int) -> Array | str:
 def read_windows(job: StackJob, windows: Iterable[Window]) -> Generator[tuple[Window, WindowFrames], None, None]:
     """Windows with the pixels of their frames, or why they cannot be read; frames that two share are read once."""
     with closing(job.open()) as reader:
-        last: dict[int, Array | str] = {}  # the last frames of the window before
-        shared = 1 + (2 * MARGIN if job.options.follow else 0)
+        last: dict[int, Array | str] = {}  # the last frame of the window before
         for window in windows:
             frames = [last[index] if index in last else stored_frame(reader.frame, index) for index in window.frames]
-            last = dict(zip(window.frames[-shared:], frames[-shared:], strict=True))
+            last = {window.last: frames[-1]}
             yield window, frames
-
-
-_TOGETHER = ("joint", "scale", "mosaic", "optics")  # options of restore that frames one by one do not have
-
-
-def options_of_windows(restoration: OptionTable) -> list[str]:
-    """Given options of ``restore`` that frames which are restored one by one do not have."""
-    given = restoration or {}
-    return [name for name in _TOGETHER if given.get(name) is True or given.get(name) not in (None, False, 1)]
-
-
-def single_frame_options(restoration: OptionTable) -> Table:
-    """Options of ``restore`` without those that frames which are restored one by one do not have."""
-    for name in options_of_windows(restoration):
-        raise ValueError(f"{name} is not available for frames that are followed one by one; use windows instead")
-    return {name: value for name, value in (restoration or {}).items() if name not in _TOGETHER}
-
-
-def _follows(options: ProcessStackOptions) -> bool | Literal["auto"]:
-    """Whether it is followed; ``"auto"`` is not where options are given that frames one by one do not have."""
-    is_known = bool(options.detection) or options.given is not None or options.motion is not None
-    if options.follow is True:
-        if is_known:
-            raise ValueError("follow=True has no options of detection, and no given detections")
-        single_frame_options(options.restoration)
-    elif options.follow == "auto" and (is_known or options_of_windows(options.restoration)):
-        return False
-    return options.follow
 
 
 def _given(
@@ -324,7 +279,7 @@ def _given(
             )
         return given
     if options.detection or given is not None or not isinstance(motion, FreeMotion):
-        raise ValueError("motion must be a FreeMotion; it has no detection, given detections or follow beside it")
+        raise ValueError("motion must be a FreeMotion; it has no detection and no given detections beside it")
     starts: list[float] = (timing.frame_starts(info.shape[0]) - timing.frame_starts(1)).tolist()
     readout = info.shape[int(timing.scan_axis)] * timing.row_time + timing.exposure_time
     ends = [(starts[window.first], starts[window.last]) for window in windows]
@@ -354,9 +309,7 @@ def plan_job(
     restoration = (options.restoration or {}) if isinstance(options, StackOptions) else None
     of_job = {"full_scale": full_scale, "device": device, "restoration": restoration, "progress": None}
     stated = ProcessStackOptions(**{**vars(options), **of_job})
-    stated = replace(stated, follow=_follows(stated))
-    margin = MARGIN if stated.follow else 0
-    windows = cut_windows(info.shape[0], stated.window, margin)
+    windows = cut_windows(info.shape[0], stated.window)
     given = _given(stated, info, timing, windows)
     job = StackJob(Path(source), info, timing, replace(stated, given=None, motion=None), given)
     if job.chosen.mosaic is not None:
@@ -369,6 +322,6 @@ def plan_job(
     else:
         most = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     at_once = windows_at_once(
-        info, stated.window, memory=options.memory, most=most, restoration=restoration, on_gpu=on_gpu, margin=margin
+        info, stated.window, memory=options.memory, most=most, restoration=restoration, on_gpu=on_gpu
     )
     return job, windows, at_once

@@ -4,20 +4,20 @@ import hashlib
 import json
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from statistics import median, stdev
 
 import numpy as np
-import torch
 
 from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.files.reading import Table
 from rsvib_torch.io.stack_info import split_range
-from rsvib_torch.motion.detected_vibration import DetectedVibration, FollowedVibration
+from rsvib_torch.motion.detected_vibration import DetectedVibration
+from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.results.presentation import (
     AXIS_NAMES,
@@ -86,48 +86,23 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
         Phases refer to ``start_s``, the exposure start of the first row of the window.
         """
         lines = []
-        for record, frame, found, middle in self._results():
-            ends = (record.first, record.last) if frame is None else (frame, frame)
-            first: Table = {"window": record.window, "first_frame": ends[0], "last_frame": ends[1]}
+        for record, middle in zip(self.windows, self._middle_times(), strict=True):
+            first: Table = {"window": record.window, "first_frame": record.first, "last_frame": record.last}
             first |= {"start_s": record.start_time, "middle_time_s": middle}
             last: Table = {"frames": record.frames, "outcome": record.outcome}
             last["bad_frames"] = len(record.bad_frames)
             last["note"] = record.error or "; ".join(map(str, record.left_alone))
-            last |= {} if record.restored_frames is None else {"restored_frames": record.restored_frames}
-            lines += [{**first, **tone, **last} for tone in ([{}] if found is None else found.tone_lines(pixel_size))]
+            tones = [{}] if record.detection is None else record.detection.tone_lines(pixel_size)
+            lines += [{**first, **tone, **last} for tone in tones]
         return joined_columns(lines)
 
-    def _results(self) -> Iterator[tuple[WindowRecord, int | None, DetectedVibration | None, float | None]]:
-        """Each detection with its window, its frame if it is that of a frame, and the middle of its frames in s."""
-        starts, half_frame = None, 0.0
-        if self.settings.get("sensor") is not None:
-            half_frame = self.timing.time_to_middle(self.input["shape"][self.timing.scan_axis])
-            starts = self.timing.frame_starts(self.windows[-1].last + 1).tolist()
-        for record in self.windows:
-            found: list[tuple[int | None, DetectedVibration | None]] = [(None, record.detection)]
-            if record.followed is not None and record.detection is not None:
-                found = [(frame, record.detection[number]) for number, frame in enumerate(record.followed)]
-            for frame, detection in found:
-                ends = (record.first, record.last) if frame is None else (frame, frame)
-                middle = None if starts is None else 0.5 * (starts[ends[0]] + starts[ends[1]]) + half_frame
-                yield record, frame, detection, middle
-
-    def followed(self) -> FollowedVibration | None:
-        """The vibration at every frame, with the time origin of the stack; None unless all windows were followed."""
-        parts = []
-        for record, frame, found, middle in self._results():
-            if frame is None or found is None or middle is None:
-                return None
-            time = torch.tensor(middle - record.start_time, dtype=torch.float64)
-            one = FollowedVibration(**{part.name: getattr(found, part.name) for part in fields(found)}, times=time)
-            parts.append(one.timed_from(-record.start_time))
-        count = max(one.gain.shape[-1] for one in parts)
-        return FollowedVibration.stacked([one.with_tones(count) for one in parts])
-
-    def times(self) -> list[float]:
-        """Time of each of the ``detections`` in s: start of the window, or middle of the frame."""
-        found = ((record.start_time, frame, middle) for record, frame, _, middle in self._results())
-        return [start if frame is None or middle is None else middle for start, frame, middle in found]
+    def _middle_times(self) -> list[float | None]:
+        """Middle of the frames of every window in s; None if the sensor is not known."""
+        if self.settings.get("sensor") is None:
+            return [None] * len(self.windows)
+        half_frame = self.timing.time_to_middle(self.input["shape"][self.timing.scan_axis])
+        starts = self.timing.frame_starts(self.windows[-1].last + 1).tolist()
+        return [0.5 * (starts[record.first] + starts[record.last]) + half_frame for record in self.windows]
 
     @property
     def bad_frames(self) -> dict[str, str]:
@@ -144,7 +119,7 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
 
         Tones are medians over the reliable windows, with the standard deviation over the windows.
         """
-        windows, found = self.windows, self.detections()
+        windows, found = self.windows, self._tones
         gains = [record.predicted_gain for record in windows if record.predicted_gain is not None]
         names = AXIS_NAMES[: max((one.vibration.num_axes for one in found if one is not None), default=2)]
         unchanged: dict[str, Table] = {name: {} for name in names}
@@ -166,32 +141,31 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
     def tone_table(self) -> tuple[list[str], list[list[str]]]:
         """Head and rows of a table of the tones of each axis: median ± standard deviation over the windows.
 
-        Of a vibration that was followed, the amplitudes in the first and in the last frame.
+        If the vibration changes in windows, the amplitudes in the first and in the last one.
         """
-        rows, count, unit = [], len(self.detections()), self._unit
+        rows, count = [], len(self.windows)
         for name, of_axis in self.totals()["tones"].items():
             for tone in of_axis["tones"] or [{"windows": 0}]:
                 texts = [
                     measured_text(tone[quantity], tone[f"{quantity}_spread"] or None) if tone["windows"] else ""
                     for quantity in ("amplitude", "frequency")
                 ]
-                if unit != "windows" and tone["windows"]:
+                if self._changing and tone["windows"]:
                     texts[0] = f"{tone['first']:.4g} … {tone['last']:.4g}"
                 rows.append([name, f"{tone['windows']} of {count}", *texts])
-        return ["axis", f"reliable {unit}", "amplitude (px)", "frequency (Hz)"], rows
+        return ["axis", "reliable windows", "amplitude (px)", "frequency (Hz)"], rows
 
     def lines(self) -> tuple[list[str], list[str]]:
         """The totals as lines of text: about the vibration, and about the restoration."""
         data = self.totals()
-        spread = f"median ± standard deviation over the {self._unit}"
-        if self._unit != "windows":
-            spread = f"amplitude: in the first and the last frame; frequency: {spread}"
+        spread, changing = "median ± standard deviation over the windows", self._changing
+        if changing:
+            spread = f"amplitude: in the first and the last window; frequency: {spread}"
         vibration = [text_table(*self.tone_table()), spread]
-        followed = [record for record in self.windows if record.followed is not None]
-        if followed and self.settings.get("follow") == "auto":
-            which = "all" if len(followed) == len(self.windows) else f"{len(followed)} of {len(self.windows)}"
-            text = f"the tones change within {which} windows, which were therefore followed from frame to frame"
-            vibration.append(wrapped(f"{text} (--follow)"))
+        if changing:
+            which = "all" if changing == len(self.windows) else f"{changing} of {len(self.windows)}"
+            text = f"the vibration changes within {which} windows, whose motion was therefore measured without tones"
+            vibration.append(wrapped(f"{text}; amplitudes are those of a tone of the same rms displacement"))
         if self.gyroscope is not None:
             found = self.gyroscope
             axes = ", ".join(letter.lower() if letter.isupper() else f"-{letter}" for letter in found["orientation"])
@@ -201,17 +175,13 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
                 f"focal length {measured_text(found['focal_length'], found['focal_length_std'])} px",
             ]
         restoration = [f"{data['restored']} of {number_of(data['windows'], 'window')} restored"]
-        if any(record.written for record in followed):
-            count = sum(record.restored_frames or 0 for record in followed)
-            which = "" if len(followed) == len(self.windows) else " of the windows that were followed"
-            restoration.append(f"{count} of {sum(record.written for record in followed)} frames{which} restored")
         if data["predicted_gain_db"] is not None:
             gains = dict.fromkeys(f"{gain:+.1f}" for gain in data["predicted_gain_db"].values())
             restoration.append(f"estimated improvement {' … '.join(gains)} dB")
         # All windows were measured, and nothing else than missing tones is stated against any axis.
         codes = {
             "failed" if one is None else one.codes((axis,))
-            for one in self.detections()
+            for one in self._tones
             for axis in range(2 if one is None else one.vibration.num_axes)
         }
         still = codes == {"no_tone"}
@@ -236,23 +206,31 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
                     number, why = next(iter(refused.items()))
                     text = f"{name} is restored as measured, but is not reliable in"
                     vibration.append(wrapped(f"{text} {number_of(len(refused), 'window')}; in window {number}: {why}"))
-            assumed = [str(one) for found in self.detections() if found is not None for one in found.assumptions]
+            assumed = [str(one) for found in self._tones if found is not None for one in found.assumptions]
             vibration += [wrapped(f"assumed: {one}") for one in assumed[:1]]
         return vibration, restoration
 
     @property
-    def is_followed(self) -> bool:
-        """Whether the vibration was followed from frame to frame in all windows, or in a video."""
-        return "video" in self.settings or self._unit == "frames"
+    def is_removed(self) -> bool:
+        """Whether another motion than a steady vibration was removed: that of a video, or one that changes."""
+        return "video" in self.settings or self._changing > 0
 
     @property
-    def _unit(self) -> str:  # what has a detection
-        followed = [record.followed is not None for record in self.windows]
-        return "frames" if all(followed) else "windows or frames" if any(followed) else "windows"
+    def _changing(self) -> int:
+        """Number of windows in which the vibration changes."""
+        return sum(record.motion is not None for record in self.windows)
 
-    def detections(self) -> list[DetectedVibration | None]:
-        """The detection of every window, or of every frame of a window that was followed; None where it failed."""
-        return [found for _, _, found, _ in self._results()]
+    @property
+    def _tones(self) -> list[DetectedVibration | None]:
+        """The tones of every window; None where the detection failed."""
+        return [record.detection for record in self.windows]
+
+    def detections(self) -> list[DetectedVibration | FreeMotion | None]:
+        """The detection of every window, or its motion if the vibration changes; None where it failed.
+
+        They are the ``given`` of ``process_stack``.
+        """
+        return [record.detection if record.motion is None else record.motion for record in self.windows]
 
 
 _SAME_TONE = 0.03  # of the frequency, or 4 std: a tone of the next window closer than this is the same one
@@ -308,7 +286,7 @@ def fingerprint(path: Path) -> Table:
 
 
 # options on which the result depends
-_SETTINGS = ("full_scale", "window", "follow", "detection", "restoration", "force", "device")
+_SETTINGS = ("full_scale", "window", "detection", "restoration", "force", "device")
 
 
 def manifest_header(job: StackJob, output: str | None, compression: str | None) -> Table:

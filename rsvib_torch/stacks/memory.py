@@ -52,7 +52,7 @@ def memory_limit(memory: str | float | None) -> int:
 
 
 def memory_needed(
-    info: StackInfo, window: int, restoration: OptionTable, count: int = 1, *, on_gpu: bool = False, margin: int = 0
+    info: StackInfo, window: int, restoration: OptionTable, count: int = 1, *, on_gpu: bool = False
 ) -> int:
     """Memory of the process in bytes while ``count`` windows are processed; arguments as in ``windows_at_once``."""
     if on_gpu:
@@ -68,11 +68,9 @@ def memory_needed(
     frame, stored = int(np.prod(info.shape[1:], dtype=object)), np.dtype(info.dtype).itemsize
     pixels = min(window, info.shape[0]) * frame
     queued = 2 * pixels * stored  # frames read ahead, and frames to be written
-    # frames around a window, as stored and as float32; less than a window takes otherwise
-    around = 2 * min(margin, info.shape[0]) * frame * (stored + 4)
     more = _MOSAIC_BYTES + _MOSAIC_FRAME_BYTES * info.shape[-2] * info.shape[-1] if mosaic else 0
     once = _PROCESS_BYTES + info.decoding_bytes + queued
-    return once + count * (_WINDOW_BYTES + pixels * pixel_bytes + queued + around + more)
+    return once + count * (_WINDOW_BYTES + pixels * pixel_bytes + queued + more)
 
 
 def windows_at_once(
@@ -83,15 +81,13 @@ def windows_at_once(
     most: int,
     restoration: OptionTable,
     on_gpu: bool = False,
-    margin: int = 0,
 ) -> int:
     """Number of windows that can be processed at once, at most ``most``, within the memory of the machine.
 
-    As many frames as ``margin`` before and after each window are read as well; their motion is measured one by one.
     The error about too little memory states the required size and the largest window that fits.
     """
     limit = memory_limit(memory)
-    needed = partial(memory_needed, info, restoration=restoration, on_gpu=on_gpu, margin=margin)
+    needed = partial(memory_needed, info, restoration=restoration, on_gpu=on_gpu)
     process, one = needed(window, count=0), needed(window)
     count = (limit - process) // (one - process)
     if count < 1:

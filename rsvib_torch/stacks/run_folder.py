@@ -250,7 +250,6 @@ class StackReport(Summarised):
         frames: Number of frames written, including those of an interrupted run that was resumed.
         windows: Number of windows of the stack.
         restored: Number of windows whose frames were restored.
-        as_taken: Number of frames of these windows that were left as taken, because their motion is not known.
         failed: Number of windows in which detection or restoration failed.
         bad_frames: Number of frames that could not be used.
         resumed: Number of windows that were complete before.
@@ -269,7 +268,6 @@ class StackReport(Summarised):
     frames: int
     windows: int
     restored: int
-    as_taken: int
     failed: int
     bad_frames: int
     resumed: int
@@ -284,8 +282,6 @@ class StackReport(Summarised):
     def summary(self) -> str:
         """Numbers of frames and windows, and the time."""
         lines = [f"{number_of(self.frames, 'frame')} in {number_of(self.windows, 'window')}, {self.restored} restored"]
-        if self.as_taken:
-            lines[0] += f" ({number_of(self.as_taken, 'frame')} of these as taken)"
         if self.frames and not self.resumed:
             lines[0] += f", {self.seconds / self.frames:.2g} s per frame"
         if self.resumed:
@@ -319,12 +315,10 @@ def run_to_file(
 
     def report(manifest: StackManifest, resumed: int) -> StackReport:
         records = manifest.windows
-        followed = [one for one in records if one.frames == "restored" and one.restored_frames is not None]
         return StackReport(
             frames=sum(record.written for record in records),
             windows=len(records),
             restored=sum(record.frames == "restored" for record in records),
-            as_taken=sum(record.written - (record.restored_frames or 0) for record in followed),
             failed=sum(record.error is not None for record in records),
             bad_frames=len(manifest.bad_frames),
             resumed=resumed,

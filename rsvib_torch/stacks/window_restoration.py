@@ -1,27 +1,31 @@
-"""Restoration of the frames of one window, with a check of each frame and a verdict; also frame by frame (follow)."""
+"""Restoration of the frames of one window, with a check of each frame and a verdict; vibration that changes.
 
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
+
+import math
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from rsvib_torch.checks.values import MAX_NUMBER, beyond_full_scale
+from rsvib_torch.detection import MotionDetection
 from rsvib_torch.frames.grey import constant_frame
-from rsvib_torch.frames.pixels import detailed_parts
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.imaging.sensor_model import sharpened
-from rsvib_torch.motion.detected_vibration import DetectedVibration, FollowedVibration
+from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
+from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import RestorationOptions
 from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError
 from rsvib_torch.restoration.restore import (
     check_optics,
-    restore_each,
     restore_prepared,
     unchanged_frames,
     warn_of_mosaic,
@@ -30,8 +34,6 @@ from rsvib_torch.restoration.verdict.judge import judge_prepared
 from rsvib_torch.restoration.verdict.trust import vibration_to_undo
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
-
-_JUDGED_COLUMNS = 320  # with the most detail; the verdict itself takes 160 of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +46,6 @@ class RestoredFrames:
     verdict: RestorationVerdict | None  # whether restoration helps; None if frames could not be compared
     moves: bool  # whether there was a vibration to remove
     axes: int = 2  # number of components of the motion: 2, 3 with roll, 4 with roll and zoom
-    as_taken: tuple[int, ...] = ()  # numbers of frames that were not restored, of frames that have a motion each
 
     def restored_axes(self) -> list[str]:
         """Names of the axes that were restored."""
@@ -55,7 +56,7 @@ class RestoredFrames:
 def restore_trusted(
     frames: Tensor,
     timing: SensorTiming,
-    motion: Motion | DetectedVibration,
+    motion: Motion | DetectedVibration | MotionDetection,
     options: RestorationOptions,
     *,
     force: bool = False,
@@ -68,7 +69,11 @@ def restore_trusted(
     at most ``most_pairs`` are compared. They are returned as taken if nothing moves, or, without ``force``, if
     restoration makes them worse.
     """
-    vibration, left_alone = vibration_to_undo(motion, timing, len(frames), frames.shape[int(timing.scan_axis)])
+    vibration: Motion
+    if isinstance(motion, MotionDetection):
+        vibration, left_alone = reliable_motion(motion)
+    else:
+        vibration, left_alone = vibration_to_undo(motion, timing, len(frames), frames.shape[int(timing.scan_axis)])
     frames = frames if first_frames is None else frames[:first_frames]
     joint, scale, optics = options.joint, options.scale, check_optics(options.optics)
     prepared = prepare_frames(frames, timing, saturation=options.saturation, mosaic=options.mosaic)
@@ -85,24 +90,6 @@ def restore_trusted(
         restored = sharpened(restored, optics, scale)
     result = prepared.from_row_order(restored) if keep else unchanged_frames(prepared, joint, scale)
     return RestoredFrames(result, keep, left_alone, verdict, True, vibration.num_axes)
-
-
-def pair_verdict(
-    frames: Tensor, timing: SensorTiming, motion: Vibration, interval: float, options: RestorationOptions
-) -> RestorationVerdict | None:
-    """Whether restoration helps, from two neighbouring frames of a motion that is followed; None if unknown.
-
-    The time origin of the motion is the middle of the first frame, and the other one starts an ``interval`` in s later.
-    """
-    if timing.scan_axis == -2 and motion.num_axes == 2:
-        frames = frames[..., detailed_parts(frames[None, None], _JUDGED_COLUMNS)[0]]
-    if not bool((motion.amplitude > 0).any()):
-        return None
-    start = -timing.time_to_middle(frames.shape[int(timing.scan_axis)])
-    prepared = prepare_frames(frames, replace(timing, frame_start_times=(start, start + interval)), channels="first")
-    with suppress(TooLittleInCommonError), torch.no_grad():
-        return judge_prepared(prepared, restore_prepared(prepared, motion, options), motion, most_pairs=1)
-    return None
 
 
 def without_data(frames: Tensor, taken: Tensor) -> Tensor:
@@ -136,10 +123,7 @@ def frame_fault(frame: Array | str, index: int, full_scale: float | None, nodata
     return constant_frame(index) if high - low <= rounding * largest else None
 
 
-# Frames before and after a window. Frequencies that differ by a multiple of the frame rate are distinguished by the
-# whole record: of tones that decay with 1.2 s at 10 to 22 frames per second, 32 frames left no wrong one.
-MARGIN = 12
-_LEAST_FRAMES = 4  # that two trackers run through
+_LEAST_FRAMES = 4  # fewer do not determine what a motion of any shape has in common in all frames
 # Reasons against an axis whose tones may change within the record
 _CHANGES = {"displacement_ambiguous", "rows_unexplained", "neighbours_unexplained"}
 
@@ -151,26 +135,60 @@ def may_change(detection: DetectedVibration, num_frames: int) -> bool:
     )
 
 
-def restore_followed(
-    frames: Tensor,
-    timing: SensorTiming,
-    followed: FollowedVibration,
-    options: RestorationOptions,
-    *,
-    force: bool = False,
-) -> RestoredFrames:
-    """``restore_trusted`` of frames that each have their own vibration."""
-    prepared = prepare_frames(frames, timing, saturation=options.saturation)
-    restored, undone, left_alone = restore_each(prepared, followed, options)
-    moving = undone.moving_axes().any(-1).tolist()
-    # Two neighbouring frames near the middle are judged.
-    verdict, starts = None, timing.frame_starts(len(moving)).tolist()
-    pairs = [index for index in range(len(moving) - 1) if moving[index] and moving[index + 1]]
-    if pairs:
-        first = min(pairs, key=lambda index: abs(2 * index + 2 - len(moving)))
-        interval = starts[first + 1] - starts[first]
-        verdict = pair_verdict(frames[first : first + 2], timing, undone[first], interval, options)
-    keep = any(moving) and (verdict is None or verdict.overall != "worse" or force)
-    result = prepared.from_row_order(restored) if keep else frames
-    unchanged = tuple(index for index, moves in enumerate(moving) if not (moves and keep))
-    return RestoredFrames(result, keep, left_alone, verdict, any(moving), as_taken=unchanged)
+_SAMPLES = 4096  # of a motion in its record, for the spectrum: 500 per frame of a window of 8
+
+
+def equivalent_tones(found: MotionDetection) -> DetectedVibration:
+    """A tone for each axis of a motion of any shape, to draw it and list it beside the tones of other windows.
+
+    The amplitude is that of a tone with the same rms displacement from a straight line. The frequency is that of the
+    largest part of the motion, with half of the resolution of its record as standard deviation.
+    """
+    # 1. The motion, less a straight line.
+    first, last = float(found.times.min()), float(found.times.max())
+    times = torch.linspace(first, last, _SAMPLES, dtype=torch.float64, device=found.times.device)
+    moved = found.motion.displacement(times)
+    centred = (times - times.mean())[:, None]
+    speed = (moved * centred).sum(0) / centred.square().sum()
+    moved = moved - moved.mean(0) - speed * centred
+    # 2. Its size, and the largest part of its spectrum.
+    window = torch.hann_window(_SAMPLES, dtype=torch.float64, device=times.device)[:, None]
+    spectrum = torch.fft.rfft(window * moved, n=4 * _SAMPLES, dim=0)
+    cycles = torch.fft.rfftfreq(4 * _SAMPLES, (last - first) / (_SAMPLES - 1), dtype=torch.float64, device=times.device)
+    largest = 1 + spectrum[1:].abs().argmax(0, keepdim=True)
+    frequency = cycles[largest].mT  # (A, 1)
+    amplitude, phase = math.sqrt(2) * moved.square().mean(0)[:, None].sqrt(), spectrum.gather(0, largest).angle().mT
+    vibration = Vibration(
+        amplitude, frequency, phase + 0.5 * math.pi - 2 * math.pi * frequency * first, image_motion=speed
+    )
+    # 3. Standard deviations.
+    displacement = found.std.square().mean((0, 1)).sqrt()
+    unknown = torch.full_like(amplitude, math.inf)
+    by_frequency = torch.full_like(amplitude, 0.5 / (last - first))
+    std = VibrationStd(
+        amplitude=math.sqrt(2) * displacement[:, None],
+        frequency=by_frequency,
+        phase=unknown,
+        period=by_frequency / frequency.square().clamp(min=1e-300),
+        image_motion=math.sqrt(12) * displacement / (last - first),
+        image_acceleration=unknown[:, 0],
+        displacement=displacement,
+    )
+    interval = (last - first) / max(len(found.times) - 1, 1)
+    return DetectedVibration(
+        vibration, std, vibration.gain(interval), found.unexplained, found.reliable, found.findings, assumptions=()
+    )
+
+
+def reliable_motion(found: MotionDetection) -> tuple[FreeMotion, tuple[Reason, ...]]:
+    """A motion of any shape without the axes that are not reliable, and a reason for each of these."""
+    motion, factor = found.motion, found.reliable.to(found.motion.coefficients)
+    kept = FreeMotion(
+        motion.coefficients * factor[:, None], motion.start, motion.spacing, motion.tones.scaled(factor), motion.camera
+    )
+    refused = [
+        Reason("axis_not_reliable", name, details={"action": "restored", "why": "; ".join(reasons)})
+        for name, reasons in zip(AXIS_NAMES, found.reasons, strict=False)
+        if reasons
+    ]
+    return kept, tuple(refused)

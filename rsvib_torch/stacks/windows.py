@@ -8,6 +8,7 @@ import torch
 
 from rsvib_torch.checks.values import check_whole_number
 from rsvib_torch.motion.detected_vibration import DetectedVibration
+from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.results.reason import Reason
 
@@ -24,13 +25,11 @@ class Window:
     first: int
     last: int  # inclusive
     kept: int  # number of frames that it writes
-    before: int = 0  # frames before the first that are read as well, to follow the vibration
-    after: int = 0  # the same after the last
 
     @property
     def frames(self) -> range:
         """Indices of the frames that are read."""
-        return range(self.first - self.before, self.last + self.after + 1)
+        return range(self.first, self.last + 1)
 
     @property
     def written(self) -> range:
@@ -43,10 +42,8 @@ class Window:
         return self.index == 0 and self.kept == self.last + 1 - self.first
 
 
-def cut_windows(num_frames: int, window: int, margin: int = 0) -> list[Window]:
+def cut_windows(num_frames: int, window: int) -> list[Window]:
     """Cut a stack into windows of at most ``window`` frames, of equal length to within one frame.
-
-    As many frames as ``margin`` before and after each window are read as well, if there are so many.
 
     Example:
         >>> [(w.first, w.last, w.kept) for w in cut_windows(8, 4)]
@@ -57,18 +54,17 @@ def cut_windows(num_frames: int, window: int, margin: int = 0) -> list[Window]:
     count = -(-pairs // (window - 1))
     borders = [index * pairs // count for index in range(count + 1)]
     borders[-1] = num_frames - 1
-    windows = []
-    for index, (first, last) in enumerate(itertools.pairwise(borders)):
-        kept, around = last - first + (index == count - 1), (min(margin, first), min(margin, num_frames - 1 - last))
-        windows.append(Window(index, first, last, kept, *around))
-    return windows
+    return [
+        Window(index, first, last, last - first + (index == count - 1))
+        for index, (first, last) in enumerate(itertools.pairwise(borders))
+    ]
 
 
 def window_timing(timing: SensorTiming, window: Window, frames: list[int]) -> SensorTiming:
     """Timing of the usable ``frames`` of a window as a stack, with the time origin at the first frame of the window."""
     if timing.frame_start_times is None and frames == list(range(window.first, window.last + 1)):
         return timing
-    starts = timing.frame_starts(window.frames[-1] + 1)
+    starts = timing.frame_starts(window.last + 1)
     return replace(timing, frame_start_times=starts[torch.tensor(frames, device="cpu")] - starts[window.first])
 
 
@@ -82,7 +78,7 @@ class WindowRecord:
     start_time: float  # s, exposure start of its first row, the time origin of its detection
     written: int  # number of frames written
     frames: Literal["restored", "as taken"]  # those that are written
-    detection: DetectedVibration | None = None  # None: it failed; of a followed window, a batch of its frames
+    detection: DetectedVibration | None = None  # None: it failed; with a ``motion``, its ``equivalent_tones``
     left_alone: tuple[Reason, ...] = ()  # a reason for each axis that was not restored
     outcome: str | None = None  # ``RestorationVerdict.overall``; None if the frames could not be compared
     predicted_gain: float | None = None  # dB, mean of ``RestorationVerdict.predicted_gain``; None if unknown
@@ -91,6 +87,4 @@ class WindowRecord:
     # Of a part of a video, rms motion in px before and after, in its first frames: ``frame_to_frame``, changes of the
     # motion of the frame, and ``rows``, of twelfths of the rows beside it. None: not measured.
     shaking: dict[str, tuple[float, ...]] | None = None
-    # of a window that was followed: the frames of its detection, and those that are restored
-    followed: tuple[int, ...] | None = None
-    restored_frames: int | None = None
+    motion: FreeMotion | None = None  # of a window in which the vibration changes, in place of tones; as the detection

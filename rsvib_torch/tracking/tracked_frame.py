@@ -18,25 +18,13 @@ from rsvib_torch.detection.verdict import Findings
 from rsvib_torch.frames.orientation import frames_from_row_order
 from rsvib_torch.frames.prepare import PreparedFrames
 from rsvib_torch.motion.timing import RowTiming
-from rsvib_torch.motion.vibration import Vibration, VibrationStd
+from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.numerics.tables import Array, table, tensor
 from rsvib_torch.options import TrackerOptions
 from rsvib_torch.restoration.frame_motion import visible_pixels
 from rsvib_torch.restoration.restore import restore_prepared, unchanged_frames
 
 TrackingState = Literal["searching", "tracking", "unusable"]
-
-
-def vibration_at_frame(fit: ToneFit, timing: RowTiming, height: int) -> tuple[Vibration, VibrationStd]:
-    """The tones at a frame with standard deviations that contain the effect of the row time.
-
-    Each frame is compared with the one before: with the sensitivity of a fit to more frames, errors of amplitudes by a
-    wrong row time were up to 8 standard deviations; with that of two frames, at most 1.1.
-    """
-    vibration, std = vibration_of_fit(fit)
-    if timing.row_time_std:
-        std = with_row_time_std(std, vibration, timing_sensitivity(fit, timing, 2, height), timing)
-    return vibration, std
 
 
 def displacement_std_at_frame(fit: ToneFit, growth: Array, timing: RowTiming, height: int) -> Array:
@@ -132,7 +120,11 @@ class TrackedFrame:
         fit, measurements, timing = self.tones.fit, self.tones.measurements, self.frame.timing
         height, width = self.frame.images.shape[-2:]
         # Standard deviations, also of the displacement of the rows of this frame.
-        _, std = vibration_at_frame(fit, timing, height)
+        vibration, std = vibration_of_fit(fit)
+        if timing.row_time_std:
+            # Each frame is compared with the one before: with the sensitivity of a fit to more frames, errors of
+            # amplitudes by a wrong row time were up to 8 standard deviations; with that of two frames, at most 1.1.
+            std = with_row_time_std(std, vibration, timing_sensitivity(fit, timing, 2, height), timing)
         known_std = displacement_std_at_frame(fit, self.tones.growth, timing, height)
         std = replace(std, displacement=tensor(known_std[None]))
         # The offset curve with the weights that a fit to these rows would have.

@@ -5,7 +5,7 @@ are measured as in ``detect_vibration`` (``detection.rows``). They correct the p
 gradients of the scene are kept while the scene stays within a few pixels. Detection from several frames
 (``detection.pipeline``) is only needed to begin, and again if the rows contradict the prediction.
 
-All that the tracker knows is one immutable ``TrackerState``. A frame takes it through these steps, each of which
+All that the tracker knows is one immutable ``_State``. A frame takes it through these steps, each of which
 returns another state: ``_measured`` or, for a late frame, ``_predicted``; then, if the motion is not known or
 contradicted, ``_detected``. The result for the user (``tracked_frame``) is made from the last state.
 
@@ -81,7 +81,7 @@ _DIRECT_ATTEMPTS = 2  # consecutive attempts; after them only bands are tried
 _FEW_ROWS = 256  # rows of a frame; smaller frames have few bands, and every attempt uses the direct method as well
 _MIN_VALID = 0.1  # of the pixels of each frame, to detect the vibration; as in detect_vibration
 _MAX_DOUBLED = 4  # times that the number of frames between two attempts to detect the vibration is doubled
-PATIENCE = 3  # consecutive frames that contradict the tones, before the state is "searching"
+_PATIENCE = 3  # consecutive frames that contradict the tones, before the state is "searching"
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +134,7 @@ class _Track:
 
 
 @dataclass(frozen=True, eq=False)
-class TrackerState:
+class _State:
     """All that the tracker knows after a frame. It is never changed: a step returns another one."""
 
     time: float = -math.inf  # s, exposure start of the last frame
@@ -147,7 +147,7 @@ class TrackerState:
     contradictions: int = 0  # consecutive frames, and starts of the filter, whose rows contradict the tones
     lost: str = ""  # why the motion is not known, of one that was followed or if times contradict the frame period
 
-    def without_track(self, reason: str) -> "TrackerState":
+    def without_track(self, reason: str) -> "_State":
         """The state without the motion that was followed, if there was one."""
         return replace(self, track=None, lost="" if self.track is None else reason)
 
@@ -193,7 +193,7 @@ class VibrationTracker:
 
     def reset(self) -> None:
         """Forget all frames, e.g. after a change of the camera's settings."""
-        self._state = TrackerState()
+        self._state = _State()
 
     @outside_graphs
     @full_precision
@@ -247,7 +247,7 @@ class VibrationTracker:
                 state = self._detected(self._measured(state)) if predicted is None else predicted
             except (ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
                 state = state.without_track(str(error).partition("\n")[0])  # no argument is wrong: they were checked
-        if not state.lost and (state.track is None or state.contradictions >= PATIENCE):
+        if not state.lost and (state.track is None or state.contradictions >= _PATIENCE):
             starts = tensor(np.array([*(frame.time for frame in self._state.frames), time]))
             state = replace(state, lost=contradiction(self._rows, starts, 0))
 
@@ -271,7 +271,7 @@ class VibrationTracker:
 
     # Tracking
 
-    def _measured(self, state: TrackerState) -> TrackerState:
+    def _measured(self, state: _State) -> _State:
         """Compare the last frame with the one before, and correct the motion that is followed."""
         track = state.track
         if track is None:
@@ -367,7 +367,7 @@ class VibrationTracker:
         )
         return TrackedTones(frame.time, fit, growth, measurements, findings)
 
-    def _predicted(self, state: TrackerState) -> TrackerState | None:
+    def _predicted(self, state: _State) -> _State | None:
         """The state with predicted tones of the last frame; None if the frame must be measured.
 
         The filter stays where it is: the next frame that is measured is compared with the last one that was.
@@ -387,7 +387,7 @@ class VibrationTracker:
 
     # Detection
 
-    def _frames_to_detect(self, state: TrackerState) -> int:
+    def _frames_to_detect(self, state: _State) -> int:
         """Number of last frames to detect the vibration from; 0 if it is known, or if it is too early to try again.
 
         After a change of the vibration, only frames behind the change are used: half a window first, then whole windows
@@ -401,7 +401,7 @@ class VibrationTracker:
             return 0
         return min(new, len(state.frames))
 
-    def _detected(self, state: TrackerState) -> TrackerState:
+    def _detected(self, state: _State) -> _State:
         """Detect the vibration in the last frames if that is due, and follow its tones from the last frame."""
         count = self._frames_to_detect(state)
         if count == 0:
@@ -448,9 +448,7 @@ class VibrationTracker:
         stacks = GreyFrames(without_mosaic(images), mask, batched=False, timing=self._rows)
         return stacks if self.options.columns is None else stacks.narrowed(self.options.columns)
 
-    def _started(
-        self, state: TrackerState, found: Attempt, chosen: Tensor, middle: float, record: float
-    ) -> TrackerState:
+    def _started(self, state: _State, found: Attempt, chosen: Tensor, middle: float, record: float) -> _State:
         """Start the filter with the ``chosen`` (2, K) tones of a detection from the last frames; measure the last one.
 
         The ``middle`` of these frames is the time origin of the detection, the ``record`` their duration (s).
@@ -472,20 +470,15 @@ class VibrationTracker:
         # allow for further tones, which the filter does not.
         size_std = torch.minimum(std.amplitude, 0.05 * vibration.amplitude)
         parts = tables(tones * ~slow, vibration.frequency, drift, 2.0 * size_std, 2.0 * std.frequency)
-        return self._begun(state, ToneFilter.started(middle, self._rows.exposure_time, *parts))
-
-    def _begun(self, state: TrackerState, started: ToneFilter) -> TrackerState:
-        """Follow tones with a filter that starts between the last two frames, and compare these."""
-        before, last = state.frames[-2:]
-        columns = (
-            slice(None) if self.options.columns is None else detailed_parts(last.images[:1], self.options.columns)[0]
-        )
-        track = _Track(started, before.spectra(columns), before.time, columns)
-        return self._measured(replace(state, track=track))
+        started = ToneFilter.started(middle, self._rows.exposure_time, *parts)
+        # 3. The last two frames, which the filter starts between.
+        (before, last), number = state.frames[-2:], self.options.columns
+        columns = slice(None) if number is None else detailed_parts(last.images[:1], number)[0]
+        return self._measured(replace(state, track=_Track(started, before.spectra(columns), before.time, columns)))
 
     # Results
 
-    def _result(self, prepared: PreparedFrames, state: TrackerState, *, usable: bool = True) -> TrackedFrame:
+    def _result(self, prepared: PreparedFrames, state: _State, *, usable: bool = True) -> TrackedFrame:
         """The result for the last frame."""
         label: TrackingState = "searching" if usable else "unusable"
         device, measurements = prepared.images.device, None
@@ -506,7 +499,7 @@ class VibrationTracker:
             motion = motion.from_row_order(self.timing)
             place = state.path + track.filter.path(state.time + half - track.filter.time)
             path = offsets_from_row_order(tensor(place).to(device), self.timing)
-            label = "searching" if state.contradictions >= PATIENCE else "tracking"
+            label = "searching" if state.contradictions >= _PATIENCE else "tracking"
         return TrackedFrame(
             time=state.time,
             state=label,

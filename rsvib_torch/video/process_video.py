@@ -27,7 +27,7 @@ from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import ProcessVideoOptions, ResourceOptions, StackOptions
 from rsvib_torch.results.presentation import plain_values
-from rsvib_torch.stacks.job import plan_job, single_frame_options
+from rsvib_torch.stacks.job import plan_job
 from rsvib_torch.stacks.manifest import fingerprint, manifest_header, rms_shaking
 from rsvib_torch.stacks.memory import share_one_heap
 from rsvib_torch.stacks.run_folder import RunFolder, StackReport, run_to_file
@@ -35,6 +35,7 @@ from rsvib_torch.video import Margins
 from rsvib_torch.video.video_frames import Frame, FrameTrack, VideoFrames
 from rsvib_torch.video.video_passes import PART_FRAMES, VideoMotion, VideoPasses, shakes_more
 
+_TOGETHER = ("joint", "scale", "mosaic", "optics")  # options of restore that frames one by one do not have
 _JUDGED_FRAMES = 4  # of each part, whose shaking decides whether it is restored
 
 # What the manifest states of the alignment of a gyroscope.
@@ -184,7 +185,11 @@ def _planned(
     source: Path, sink: Path, timing: SensorTiming, options: ProcessVideoOptions, rates: AngularRates | None
 ) -> tuple[VideoPasses, int]:
     """The job of a run with the layout of its frames, and the number of frames to restore at the same time."""
-    given = single_frame_options(options.restoration)
+    given = options.restoration or {}
+    for name in _TOGETHER:
+        if given.get(name) is True or given.get(name) not in (None, False, 1):
+            raise ValueError(f"{name} is not available for frames that are followed one by one; use windows instead")
+    given = {name: value for name, value in given.items() if name not in _TOGETHER}
     resources = {name: getattr(options, name) for name in fields_of(ResourceOptions)}
     job, _, at_once = plan_job(source, timing, StackOptions(restoration=given, window=2, **resources))
     with closing(open_stack(source)) as reader:

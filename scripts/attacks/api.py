@@ -215,8 +215,6 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     described = (detected.std, curve, optics, sensor_noise, info, report, verdict, calibration, camera)
     described += (tracked,)
     described += (detected.spectrum(), rsv.CameraMode("A", "B", "", 1920, 1080, 30.0, 0.01, 1e-4, 3, "forward", 1080))
-    of_frame = {one.name: getattr(detected, one.name) for one in fields(rsv.FollowedVibration) if one.name != "times"}
-    described += (rsv.FollowedVibration(**of_frame, times=times[0]),)
     described += (detected, detected.offsets, free, alignment, rates, rotation)
     for value in described:
         result[type(value).__name__] = _with_fields(value)

@@ -1,9 +1,9 @@
 """Stated standard deviations compared with errors and with the Cramér-Rao bound, on simulated recordings.
 
 Seeds follow from the version. Every recording has a scene, motion and noise of its own. Tones have 0.3 to 4 px and 0.3
-to 5 times the frame rate, exposures 1 to 200 rows of 2048; roll and zoom 0.2 to 2 px at half the width. Followed tones
-decay or sweep. Free motions are random walks, smooth motions, sums of three tones, and single tones within 8 % of the
-frequency at which all frames have the same displacement; the error is that of the part of the motion that differs
+to 5 times the frame rate, exposures 1 to 200 rows of 2048; roll and zoom 0.2 to 2 px at half the width. Free motions
+are random walks, smooth motions, sums of three tones, single tones within 8 % of the frequency at which all frames
+have the same displacement, and tones that decay or sweep; the error is that of the part of the motion that differs
 between frames, and of the whole motion. Row times from light have random row times and LED frequencies, in front of a
 plain wall, with 20 times the noise, of textured scenes in one frame, strong and weak, and in four frames.
 
@@ -54,7 +54,7 @@ FRAMES, ROWS, COLUMNS, NOISE, RIM = 5, 192, 160, 0.005, 12
 TONES = {"tone, 2 frames": 2, "tone, 4 frames": 4, "tone, 8 frames": 8}
 TURNS = {"roll, 4 frames": ("roll",), "zoom, 4 frames": ("roll", "zoom")}
 TRACKED = "tracker, 12 frames"
-FOLLOWED = {"followed: decay, 16 frames": (3.0, 0.0), "followed: sweep, 16 frames": (0.0, 3.0)}  # largest 1/s, Hz/s
+CHANGES = {"decay": (3.0, 0.0), "sweep": (0.0, 3.0)}  # largest 1/s, Hz/s
 FIXED = {  # amplitudes (px, px, rad, 1) and frequencies of the axes
     "amplitudes of 0.2 and 0.13 px": ((0.2, 0.13), (155.0, 155.0)),
     "no roll": ((3.0, 5.0), (90.0, 61.0)),
@@ -64,7 +64,7 @@ FIXED = {  # amplitudes (px, px, rad, 1) and frequencies of the axes
     "roll with the frequency of x": ((3.0, 5.0, 1e-3), (70.0, 61.0, 70.0)),
     "roll 1 mrad, zoom 5e-4": ((3.0, 5.0, 1e-3, 5e-4), (90.0, 61.0, 70.0, 53.0)),
 }
-FREE = tuple(f"free motion: {kind}" for kind in ("walk", "smooth", "tones", "nearly blind"))
+FREE = tuple(f"free motion: {kind}" for kind in ("walk", "smooth", "tones", "nearly blind", *CHANGES))
 CALIBRATIONS = ("wall", "noisy wall", "textured", "weakly textured", "textured, four frames")
 BY_MOTION: dict[str, tuple[Any, Any, Any, Any]] = {  # amplitudes, frequencies, limits of the row time, and direction
     "row time by motion: 83 Hz along x, known to 12 %": (((3.0,), (0.0,)), ((83.0,), (1.0,)), (0.88, 1.12), "forward"),
@@ -73,7 +73,7 @@ BY_MOTION: dict[str, tuple[Any, Any, Any, Any]] = {  # amplitudes, frequencies, 
     "row time by motion: four tones": (((1.5, 0.5), (1.1, 0.4)), ((41.0, 133.0), (67.0, 185.0)), None, None),
     "row time by motion: random tones": (None, None, None, None),
 }
-KINDS = (*TONES, *TURNS, TRACKED, *FOLLOWED, *FREE, *(f"row time: {kind}" for kind in CALIBRATIONS), *FIXED, *BY_MOTION)
+KINDS = (*TONES, *TURNS, TRACKED, *FREE, *(f"row time: {kind}" for kind in CALIBRATIONS), *FIXED, *BY_MOTION)
 OPTIONS = {
     "bar_kinds": (KINDS, "error_bars: kinds of recordings", KINDS),
     "bar_recordings": (200, "error_bars: recordings of each kind"),
@@ -178,31 +178,6 @@ def recorded(motion: Curve, count: int, draw: Generator) -> torch.Tensor:
     return torch.from_numpy(clean + NOISE * draw.standard_normal(clean.shape)).float()
 
 
-def followed(kind: str, number: int) -> Iterator[Error]:
-    """Errors at every fifth frame of a tone of each axis that decays or sweeps, and of the rows, rms over the rows."""
-    draw = generator_of(kind, number)
-    tone = np.concatenate([one_tone(draw, 0.5, 3.0) for _ in range(2)])
-    decay, sweep = (draw.uniform(0.1, 1, 2) * largest for largest in FOLLOWED[kind])
-
-    def moved(times: Array) -> Array:
-        turns = (tone[:, 1] * FRAME_PERIOD / TIMING.frame_period + 0.5 * sweep * times[..., None]) * times[..., None]
-        return tone[:, 0] * np.exp(-decay * times[..., None]) * np.sin(2 * np.pi * turns + tone[:, 2])
-
-    found = rsv.follow_vibration(recorded(Curve(moved), 16, draw), TIMING)
-    moments = TIMING.row_starts(16, ROWS) + 0.5 * TIMING.exposure_time
-    for frame in range(0, 16, 5):
-        shown, middle = found.vibration[frame], float(moments[frame].mean())
-        left = shown.translation().displacement(moments[frame]).numpy() - moved(moments[frame].numpy())
-        true = {"amplitude": tone[:, 0] * np.exp(-decay * middle)}
-        true["frequency"] = tone[:, 1] * FRAME_PERIOD / TIMING.frame_period + sweep * middle
-        for axis in found.reliable[frame].nonzero()[:, 0].tolist():
-            for name, truth in true.items():
-                value, std = (float(getattr(part, name)[frame, axis, 0]) for part in (found.vibration, found.std))
-                yield f"x, y {name}", value - truth[axis], std, math.nan
-            size = float(rms((left - left.mean(0))[:, axis, None])[0])
-            yield "rms displacement of rows", size, float(found.std.displacement[frame, axis]), math.nan
-
-
 # Free motion
 
 
@@ -211,7 +186,12 @@ def drawn(kind: str, draw: Generator) -> Curve:
     span = 1.2 * FRAMES * TIMING.frame_period
     times = np.linspace(-0.1 * span, span, 400)
     turns = times[:, None] / TIMING.frame_period
-    if kind == "walk":
+    if kind in CHANGES:
+        tone = np.concatenate([one_tone(draw, 0.5, 3.0) for _ in range(2)])
+        decay, sweep = (draw.uniform(0.1, 1, 2) * largest for largest in CHANGES[kind])
+        cycles = tone[:, 1] * FRAME_PERIOD * turns + 0.5 * sweep * times[:, None] ** 2
+        path = tone[:, 0] * np.exp(-decay * times[:, None]) * np.sin(2 * np.pi * cycles + tone[:, 2])
+    elif kind == "walk":
         path = gaussian_filter1d(np.cumsum(draw.standard_normal((400, 2)), 0), 8, axis=0)
         path *= 2.0 / path.std(0)
     elif kind == "smooth":
@@ -315,8 +295,6 @@ def errors_of(kind: str, number: int, size: int) -> Iterator[Error]:
     """All errors of a recording."""
     if kind in FREE:
         return free_motion(kind, number)
-    if kind in FOLLOWED:
-        return followed(kind, number)
     if kind.startswith("row time: "):
         return calibration(kind, number)
     return by_motion(kind, number, size) if kind in BY_MOTION else tones(kind, number, size)

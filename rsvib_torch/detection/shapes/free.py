@@ -1,20 +1,18 @@
 """Free motion: a displacement of any shape, fitted as a spline in time whose power spectrum is estimated from the data.
 
 Frames are registered to each other, so only differences of displacement between frames that contain the same scene row
-are measured. A penalised spline (P-spline) whose smoothness maximises the marginal likelihood gives a first estimate;
-then the power spectrum of the motion is estimated by expectation maximisation, which yields realistic uncertainties of
-the components that the differences do not determine.
+are measured. ``spline_fit`` fits them, and estimates what they do not determine.
 
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy import linalg, sparse
 from torch import Tensor
 from torch.nn import functional
 
@@ -28,13 +26,13 @@ from rsvib_torch.detection.rows.grouped_frames import (
     grouped_strips,
 )
 from rsvib_torch.detection.sensitivity import displacements_by_row_time
+from rsvib_torch.detection.shapes.spline_fit import SplineFit, fit_spline
 from rsvib_torch.detection.start import BandStart, band_start
 from rsvib_torch.detection.strips import FieldScale, camera_in_row_order
 from rsvib_torch.detection.tones.fit import ToneFit, fit_tones, fitted_again, motion_of_fit, residual_of
 from rsvib_torch.detection.tones.selection import find_tones, with_best_aliases
 from rsvib_torch.detection.tones.uncertainty import with_further_tones
 from rsvib_torch.detection.verdict import rotation_reasons, scene_reasons
-from rsvib_torch.execution.chunking import runs
 from rsvib_torch.execution.parallel import threads_for
 from rsvib_torch.execution.precision import full_precision, without_gradients
 from rsvib_torch.frames.entry_points import frames_options
@@ -45,15 +43,14 @@ from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration
-from rsvib_torch.numerics.splines import gauss_legendre, spline_taps
-from rsvib_torch.numerics.tables import Array, split_axis, table, tensor
+from rsvib_torch.numerics.splines import gauss_legendre
+from rsvib_torch.numerics.tables import Array, table, tensor
 from rsvib_torch.options import FreeMotionOptions, RegistrationOptions
 from rsvib_torch.results.presentation import AXIS_NAMES, JudgedResult, axis_rows, verdict_table
 from rsvib_torch.results.reason import Findings, Reason
 from rsvib_torch.text import measured_text
 
 _MAX_BAND_ERROR = 0.1  # px; smaller differences between the offsets of row bands and a motion are errors of bands
-_SECOND = (1.0, -2.0, 1.0)  # second difference
 _MAX_STD_SEEN = 0.3  # px, of the visible part of a reliable motion; frames of different scenes have more
 # rms of the part of a spline that all frames have in common over that of the rest. With frame_rows of the image height
 # instead of 300, a tone of 1.6 px became a motion of 25 px, whose visible part has 0.4 px
@@ -190,7 +187,7 @@ def _detect(stack: GreyFrames, timing: SensorTiming, options: FreeMotionOptions,
     if knot_rows > longest:
         raise ValueError(f"knot_rows must be at most {longest}, the row times of the stack, got {knot_rows}")
     spacing = max(knot_rows * rowwise.row_time, (record[1] - record[0]) / 3000)  # s; the cost grows with knots^3
-    motion = _motion(_fit_spline(start.measurements, max(spacing, 0.5 * start.measurements.average_times[0]), record))
+    motion = _motion(fit_spline(start.measurements, max(spacing, 0.5 * start.measurements.average_times[0]), record))
     rows, motion = _measured_around(motion, stack, rowwise, spacing, options.iterations, None)
     if not scale.same_for_all_columns:
         still = torch.zeros_like(motion.coefficients[:, :1]).expand(-1, scale.axes - 2, -1)
@@ -205,20 +202,19 @@ def _detect(stack: GreyFrames, timing: SensorTiming, options: FreeMotionOptions,
     starts = rowwise.frame_starts(stack.images.shape[1])
     rows_of_report = np.linspace(0, scale.height - 1, min(32, scale.height))
     times = starts[:, None] + tensor(rows_of_report) * rowwise.row_time + 0.5 * rowwise.exposure_time
-    fit = _fit_spline(weighed, motion.spacing, record, table(times).ravel())
+    fit = fit_spline(weighed, motion.spacing, record, table(times).ravel())
     spread = of_noise = _Spread.of(fit, measured, times)
     by_row_time = np.zeros_like(measured.displacements)
     if rowwise.row_time_std:
         by_row_time = displacements_by_row_time(measured, motion[0], rowwise, len(starts))
         changed = replace(weighed, displacements=weighed.displacements + by_row_time)
-        other = _fit_spline(changed, motion.spacing, record, table(times).ravel())
+        other = fit_spline(changed, motion.spacing, record, table(times).ravel())
         changes = other.coefficients - fit.coefficients
         fit = replace(fit, covariances=[of + np.outer(c, c) for of, c in zip(fit.covariances, changes, strict=True)])
         spread = _Spread.of(fit, measured, times)
     motion = _motion(fit, (0.25 * scale.width, 0.25 * scale.height))  # px; beyond, frames share too little
     # 3. The tones that explain the rows as well.
-    tones = _agreeing_tones(measured, motion[0], rowwise, of_noise.seen)
-    free, spread = tones.in_place(motion[0], spread, times, by_row_time)
+    free, spread = _with_tones(measured, motion[0], spread, of_noise.seen, times, rowwise, by_row_time)
     # 4. The row bands, which may contradict the motion of the middle column.
     of_middle: Motion = motion
     if not scale.same_for_all_columns:
@@ -247,7 +243,7 @@ def _measured_around(
         if number:
             measurements = measurements.reweighted(residual_of_motion(measurements, motion[0]))
         # while iterating, any drift is an image motion, which the scene rows of the groups follow
-        motion = _motion(_fit_spline(measurements, spacing, record_of(stack, timing)))
+        motion = _motion(fit_spline(measurements, spacing, record_of(stack, timing)))
     return replace(measured, measurements=measurements), motion
 
 
@@ -295,29 +291,28 @@ def _moved(measured: Measurements, motion: Motion) -> Array:
     return table(torch.stack(at_nodes, -1) @ shares)
 
 
-def _offsets_of_bands(banded: Measurements, displacements: Array) -> Array:
-    """(N, 2) px, offsets of the bands that were found from displacements (1, N, 2, 2)."""
-    return np.diff(displacements[0], axis=1)[banded.weights[0].min(-1) > 0, 0]
-
-
 def _bands_reasons(start: BandStart, columns: int, motion: Motion, axes: int = 2) -> list[list[Reason]]:
     """Reasons against a motion of each axis in row order that the row bands of one stack of ``columns`` px contradict.
 
     Noise without a scene has offsets of any size, and rows that are measured around a fit to them confirm it.
     """
     banded = start.measurements
-    values = _offsets_of_bands(banded, banded.displacements)
-    size = np.abs(values - values.mean(0)).mean(0).tolist()
-    allowed = [max(_MAX_BAND_ERROR, 0.3 * axis) for axis in size]  # px
-    rest = _offsets_of_bands(banded, residual_of_motion(banded, motion))
-    best = np.sort(np.abs(rest), 0)[: math.ceil(0.75 * len(rest))]  # clouds may cover the others
-    compared = zip(AXIS_NAMES, best.mean(0).tolist(), allowed, strict=False)
-    against = [[Reason("bands_contradict", *of_axis)] if of_axis[1] > of_axis[2] else [] for of_axis in compared]
-    of_all = scene_reasons(start.curve, columns)[0]
-    return [of_all + of_axis for of_axis in [*against, [], []][:axes]]
+    found = banded.weights[0].min(-1) > 0
+    offsets, rest = (  # (N, 2) px, of the bands that were found
+        np.diff(values[0], axis=1)[found, 0] for values in (banded.displacements, residual_of_motion(banded, motion))
+    )
+    allowed = np.maximum(_MAX_BAND_ERROR, 0.3 * np.abs(offsets - offsets.mean(0)).mean(0))  # px
+    left = np.sort(np.abs(rest), 0)[: math.ceil(0.75 * len(rest))].mean(0)  # clouds may cover the other bands
+    against = scene_reasons(start.curve, columns)[0]
+    return [
+        [*against, Reason("bands_contradict", name, float(left[axis]), float(allowed[axis]))]
+        if axis < 2 and left[axis] > allowed[axis]
+        else list(against)
+        for axis, name in enumerate(AXIS_NAMES[:axes])
+    ]
 
 
-def _motion(fit: "_SplineFit", largest_drift: tuple[float, float] = (0.0, 0.0)) -> FreeMotion:
+def _motion(fit: SplineFit, largest_drift: tuple[float, float] = (0.0, 0.0)) -> FreeMotion:
     """The spline as a batch of one motion; a drift by more than ``largest_drift`` px becomes its image motion."""
     coefficients, knots = tensor(fit.coefficients), tensor(fit.knots)
     centred = knots - knots.mean()
@@ -326,178 +321,6 @@ def _motion(fit: "_SplineFit", largest_drift: tuple[float, float] = (0.0, 0.0)) 
     speed = torch.where(functional.pad(large, (0, len(speed) - 2)), speed, 0.0)  # none of roll and zoom
     drift = Vibration(torch.zeros_like(speed)[None, :, None], 0.0, 0.0, speed[None])
     return FreeMotion((coefficients - speed[:, None] * knots)[None], fit.start, fit.spacing, drift)
-
-
-# --- Spline fit ---
-
-
-@dataclass(frozen=True, eq=False)
-class _SplineFit:
-    """Cubic spline ``sum_n c_n B((t - start) / spacing - n + 1)`` of each axis."""
-
-    coefficients: Array  # (A, N) float64 px, with mean 0
-    start: float  # time of the first knot in seconds
-    spacing: float  # seconds between knots
-    covariances: list[Array]  # (N, N) float64 px^2 of the coefficients of each axis; none while iterating
-
-    @property
-    def knots(self) -> Array:
-        """(N,) s, times of the coefficients."""
-        return self.start + (np.arange(self.coefficients.shape[-1]) - 1.0) * self.spacing
-
-    def variances(self, index: Array, weights: Array) -> Array:
-        """Variances (S, F, A) of sums of ``weights`` (S, F, M) times coefficients ``index`` (S, M)."""
-        parts = [covariance[index[:, :, None], index[:, None]] for covariance in self.covariances]
-        variances = [((weights @ of_axis) * weights).sum(-1) for of_axis in parts]
-        return np.maximum(np.stack(variances, -1), 0.0)
-
-
-def _fit_spline(
-    measurements: Measurements, spacing: float, record: tuple[float, float], report_times: Array | None = None
-) -> _SplineFit:
-    """Fit a spline with knots at a spacing in seconds to the measurements of one stack (B = 1), each axis by itself.
-
-    Minimises ``sum w (d - relative(D))^2 + lambda |D''|^2``; lambda maximises the marginal likelihood. Rows are
-    compared within groups of frames only, so that the normal matrix is banded. ``record`` is start and end in seconds.
-    ``report_times`` (S,) in s are those over which the motion has mean 0, if its uncertainty is asked for. The power
-    spectrum of the motion is then estimated as well, for splines of up to 800 knots.
-    """
-    first, last = record
-    count = math.ceil((last - first) / spacing) + 3
-    seen, exposure_time, mean = measurements.visible[0], measurements.exposure_time, None
-    if report_times is not None:
-        index, weights = spline_taps(report_times, first, spacing, count)
-        mean = np.bincount(index.ravel(), weights.ravel(), count) / len(report_times)
-    coefficients, covariances = [], []
-    for axis in range(measurements.displacements.shape[-1]):
-        # 1. The coefficients that each displacement depends on, which is a mean over the exposure and a band.
-        average = measurements.average_times[min(axis, 1)] + exposure_time
-        nodes, shares = (table(values) for values in gauss_legendre(3 + math.ceil(2 * average / spacing)))
-        begin = measurements.exposure_starts[0] + 0.5 * (exposure_time - average)
-        index, weights = spline_taps(begin[..., None] + average * nodes, first, spacing, count)  # (R, G, Q, 4)
-        index, weights = index.reshape(*seen.shape, -1), (shares[:, None] * weights).reshape(*seen.shape, -1)
-        # 2. The normal equations.
-        values, of_rows = measurements.displacements[0, ..., axis] * seen, measurements.inverse_variances[0, :, axis]
-        weighted, energy = of_rows[:, None] * values, float((of_rows[:, None] * np.square(values)).sum())
-        right = np.bincount(index.ravel(), (weights * weighted[..., None]).ravel(), count)
-        band = _normal_band(index, weights, seen, of_rows, count)
-        # 3. Their solution.
-        known = max(float(measurements.num_measurements[0, axis]), 1.0)
-        value, covariance = _solved_spline(band, right, energy, known, mean)
-        coefficients.append(value - value.mean())
-        covariances += [] if covariance is None else [covariance]
-    return _SplineFit(np.stack(coefficients), first, spacing, covariances)
-
-
-def _normal_band(index: Array, weights: Array, seen: Array, row_weights: Array, count: int) -> Array:
-    """Lower band (D, N) of the normal matrix of N = ``count`` coefficients for values relative to their group.
-
-    The value of a row in a frame depends on the coefficients ``index`` (R, G, M) by the factors ``weights``. ``seen``
-    (R, G) is 1 where a frame contains the row, else 0; ``row_weights`` (R,) are those of the rows.
-    """
-    number, frames = seen.shape
-    value = np.arange(seen.size)
-    # 1. Values of the rows in all frames as functions of the coefficients, less their mean over the frames.
-    places = (value.repeat(index.shape[-1]), index.ravel())
-    values = sparse.csr_array(((weights * seen[..., None]).ravel(), places), shape=(seen.size, count))
-    values.eliminate_zeros()
-    of_rows = sparse.csr_array((seen.ravel(), (value, value // frames)), shape=(seen.size, number))
-    mean = sparse.diags_array(1 / np.maximum(seen.sum(1), 1.0)) @ (of_rows.T @ values)
-    relative = values - of_rows @ mean
-    # 2. The weighted products of the columns.
-    normal = (relative.T @ sparse.diags_array(row_weights.repeat(frames)) @ relative).tocoo()
-    below = normal.row >= normal.col
-    band = np.zeros((int((normal.row - normal.col).max(initial=0)) + 1, count))
-    band[(normal.row - normal.col)[below], normal.col[below]] = normal.data[below]
-    return band
-
-
-def _solved_spline(
-    band: Array, right: Array, energy: float, known: float, mean: Array | None
-) -> tuple[Array, Array | None]:
-    """Coefficients (N,) of a smooth spline, and their covariance (N, N).
-
-    ``energy`` is the weighted sum of the squared displacements, of which ``known`` are independent; ``mean`` (N,) is a
-    function of the coefficients without variance, None for no covariance.
-    """
-    count = len(right)
-    rounding = 1e-12 * energy  # error of the sums that make the residual energy
-    scale = band[0].mean() + 1e-300
-    bend = np.zeros((max(3, len(band)), count))  # of the squared second differences
-    for j, factor_j in enumerate(_SECOND):
-        for i, factor_i in enumerate(_SECOND[j:]):
-            bend[i, j : j + count - 2] += factor_i * factor_j
-    base = np.pad(band, [(0, len(bend) - len(band)), (0, 0)])
-    base[0, count // 2] += scale  # the mean is undetermined
-
-    def solution(smoothness: float) -> tuple[Array, Array]:
-        """Coefficients and banded Cholesky factor of the normal matrix."""
-        factor = linalg.cholesky_banded(base + smoothness * scale * bend, lower=True, check_finite=False)
-        return linalg.cho_solve_banded((factor, True), right, check_finite=False), factor
-
-    def evidence(smoothness: float) -> float:
-        """Logarithm of the marginal likelihood."""
-        coefficients, factor = solution(smoothness)
-        residual = max(energy - float(right @ coefficients), rounding) + 1e-300
-        logarithm = 2 * float(np.log(factor[0]).sum()) - (count - 2) * math.log(smoothness)
-        return -0.5 * (known * math.log(residual / known) + logarithm)
-
-    decade = max((10.0**power for power in range(-8, 5)), key=evidence)
-    smoothness = max((decade * 10 ** (step / 3) for step in (0, -2, -1, 1, 2)), key=evidence)
-    coefficients, _ = solution(smoothness)
-    noise = max(energy - float(right @ coefficients), rounding) / known
-    if mean is None:
-        return coefficients, None
-    if count <= 800 and noise > 0:  # the cost grows with knots^3, 20 times
-        solved = _fit_with_spectrum(_dense(band), tensor(right), noise, smoothness * float(scale))
-        coefficients, covariance = map(table, solved)
-    else:
-        factor = torch.linalg.cholesky(_dense(base + smoothness * scale * bend))
-        covariance = noise * table(torch.cholesky_inverse(factor))
-    # the mean is taken out: c - (mean . c) instead of c
-    of_mean = covariance @ mean
-    return coefficients, covariance - of_mean - of_mean[:, None] + mean @ of_mean
-
-
-def _dense(band: Array) -> Tensor:
-    """The symmetric matrix (N, N) of a lower band (D, N)."""
-    lower = sparse.dia_array((band, -np.arange(len(band))), shape=(band.shape[1],) * 2).toarray()
-    return tensor(lower + np.tril(lower, -1).T)
-
-
-def _fit_with_spectrum(gram: Tensor, right: Tensor, noise: float, smoothness: float) -> tuple[Tensor, Tensor]:
-    """Coefficients (N,) of a spline and their covariance (N, N), with the power of each frequency estimated.
-
-    A motion with a resonance has more power there than the smoothness penalty assumes, and may have more in
-    undetermined components of similar frequency. The coefficients are a straight line and cosines, ``c = sum_j a_j
-    cos(w_j (n + 1/2))`` with a_j of variance s_j. Expectation maximisation alternates between a for given s, and s_j =
-    mean of ``a_j^2 + var(a_j)`` over neighbouring frequencies, relative to the penalty.
-
-    ``gram`` (N, N) and ``right`` (N,) are the normal equations, ``noise`` is the variance of measurements of unit
-    weight, and ``smoothness`` the weight of squared second differences to start with.
-    """
-    count = len(right)
-    margin = max(10, count // 16)  # knots beyond the record, as cosines have zero slope at their ends
-    length = count + 2 * margin
-    order, place = tensor(np.arange(float(length))), tensor(np.arange(float(count)))
-    angle = math.pi / length * order
-    waves = torch.cos(angle * (place[:, None] + margin + 0.5)) * math.sqrt(2 / length)
-    line = place - place.mean()
-    columns = torch.cat([waves, (line / line.norm())[:, None]], 1)
-    matrix = columns.mT @ gram @ columns / noise
-    target = columns.mT @ right / noise
-    expected = noise / smoothness * (2 * torch.sin(0.5 * angle[1:])) ** -4
-    window = torch.exp(-0.5 * ((order[1:, None] - order[1:]) / 2.0) ** 2)  # standard deviation: one cycle in the record
-    window = window / window.sum(1, keepdim=True)
-    anchor = (1e-9 * matrix.diagonal().mean()).expand(1)  # makes the undetermined mean 0
-    power = expected
-    for _ in range(20):
-        whole = matrix + torch.diag(torch.cat([anchor, anchor + 1 / power, anchor]))
-        covariance = torch.cholesky_inverse(torch.linalg.cholesky(whole))
-        amplitude = covariance @ target
-        second_moment = amplitude[1:-1].square() + covariance.diagonal()[1:-1]
-        power = (window @ (second_moment / expected)) * expected
-    return columns @ amplitude, columns @ covariance @ columns.mT
 
 
 # --- Uncertainty, and tones ---
@@ -512,30 +335,9 @@ class _Spread:
     unseen: Array  # (A,) of their mean over the frames
 
     @classmethod
-    def of(cls, fit: _SplineFit, measured: Measurements, times: Tensor) -> "_Spread":
+    def of(cls, fit: SplineFit, measured: Measurements, times: Tensor) -> Self:
         """That of a spline."""
-        index, weights = spline_taps(table(times).ravel(), fit.start, fit.spacing, fit.coefficients.shape[-1])
-        of_rows = np.sqrt(fit.variances(index, weights[:, None]))[:, 0]
-        return cls(split_axis(of_rows, 0, *times.shape), *_visible_and_common(fit, measured))
-
-
-def _visible_and_common(fit: _SplineFit, measured: Measurements) -> tuple[Array, Array]:
-    """(A,) px, rms standard deviations of displacements of scene rows less their mean over the frames, and of this."""
-    seen = measured.visible[0]
-    several = seen.sum(-1) > 1
-    seen, times = seen[several], measured.exposure_starts[0][several] + 0.5 * measured.exposure_time
-    first = np.where(seen > 0, times, np.inf).min(1, keepdims=True)
-    index, weights = spline_taps(np.where(seen > 0, times, first), fit.start, fit.spacing, fit.coefficients.shape[-1])
-    sums = np.zeros((2, len(fit.coefficients)))
-    for part in runs(len(seen), 256):  # (256, G, 4 G, 4 G) at a time
-        frames = seen[part].shape[1]
-        of_frames = (np.eye(frames)[:, :, None] * weights[part, None]).reshape(-1, frames, 4 * frames)  # (n, G, 4 G)
-        share = seen[part] / seen[part].sum(1, keepdims=True)
-        mean = (share[:, :, None] * of_frames).sum(1, keepdims=True)
-        indices = index[part].reshape(-1, 4 * frames)
-        of_visible = fit.variances(indices, of_frames - mean)
-        sums += np.stack([(of_visible * seen[part, :, None]).sum((0, 1)), fit.variances(indices, mean).sum((0, 1))])
-    return np.sqrt(sums[0] / seen.sum()), np.sqrt(sums[1] / len(seen))
+        return cls(fit.std_at(table(times)), *fit.std_of_visible(measured))
 
 
 # rms difference of the displacements of rows by tones from those by a spline, over their standard deviation. Of 240
@@ -547,59 +349,26 @@ _MAX_APART = 1.3
 _FRAMES_BESIDE = 2
 
 
-@dataclass(frozen=True, eq=False)
-class _Tones:
-    """Tones of the rows of one stack."""
-
-    fit: ToneFit  # the fit to them
-    weighed: Measurements  # the rows with the weights of the fit
-    agree: NDArray[np.bool_]  # (A,) axes whose rows they explain as well as a spline
-
-    def in_place(
-        self, motion: FreeMotion, spread: _Spread, times: Tensor, by_row_time: Array
-    ) -> tuple[FreeMotion, _Spread]:
-        """The motion with tones in place of the spline, on axes that they explain as well.
-
-        The spline is kept where the tones are more uncertain than they differ from it, and where the frames are too
-        few, so that different tones agree; their difference then counts as its standard deviation. ``by_row_time`` (1,
-        N, G, A) px are the changes of the displacements by the standard deviation of the row time.
-        """
-        if not self.agree.any():
-            return motion, spread
-        # 1. The standard deviation of the tones, with the allowance for a further one.
-        starts = table(times).ravel() - 0.5 * self.weighed.exposure_time
-        of_noise = with_further_tones(self.weighed, self.fit, starts)[1].displacement_std[0]
-        changed = replace(self.weighed, displacements=self.weighed.displacements + by_row_time)
-        shifted = fit_tones(changed, self.fit, self.fit.active)
-        change = table(motion_of_fit(shifted)[0].displacement(times) - motion_of_fit(self.fit)[0].displacement(times))
-        of_tones = np.hypot(of_noise, change - change.mean((0, 1)))
-        # 2. The axes on which they are better.
-        difference = table(self._replaced(motion, self.agree).displacement(times) - motion.displacement(times))
-        size, uncertain, of_spline = difference.std((0, 1)), _rms_of_rows(of_tones), _rms_of_rows(spread.of_rows)
-        taken = self.agree & ((uncertain < of_spline) | (2 * uncertain < size))
-        taken &= self.fit.active[0].sum(-1) <= len(times) - _FRAMES_BESIDE
-        # 3. The motion and its standard deviations.
-        of_rows = np.where(taken, of_tones, np.hypot(spread.of_rows, size))
-        unseen = np.where(taken, uncertain, np.hypot(spread.unseen, size))
-        return self._replaced(motion, taken), _Spread(of_rows, spread.seen, unseen)
-
-    def _replaced(self, motion: FreeMotion, axes: NDArray[np.bool_]) -> FreeMotion:
-        """The motion with tones and a straight line in place of the spline of some axes."""
-        tones = motion_of_fit(replace(self.fit, active=self.fit.active & axes[:, None]))[0]
-        knots, speed = motion.knots, motion.tones.image_motion
-        line = (tones.image_motion - speed)[:, None] * (knots - knots.mean())
-        coefficients = torch.where(torch.from_numpy(axes)[:, None], line, motion.coefficients)
-        return FreeMotion(coefficients, motion.start, motion.spacing, replace(tones, image_motion=speed))
-
-
-def _agreeing_tones(measured: Measurements, motion: FreeMotion, timing: RowTiming, of_noise: Array) -> _Tones:
-    """The tones of the rows of one stack, and whether they explain the rows of an axis as well as the motion.
+def _with_tones(
+    measured: Measurements,
+    motion: FreeMotion,
+    spread: _Spread,
+    seen: Array,
+    times: Tensor,
+    timing: RowTiming,
+    by_row_time: Array,
+) -> tuple[FreeMotion, _Spread]:
+    """The motion with tones in place of the spline, on axes whose rows they explain as well.
 
     The spline has a smooth power spectrum, in which a tone near a multiple of the frame rate, which the frames hardly
     show, is nearly missing. A few tones that agree with the same rows are the simpler explanation, and determine also
-    what all frames have in common. ``of_noise`` (A,) px are the standard deviations of the motion of rows between
-    frames by noise.
+    what all frames have in common. The spline is kept where the tones are more uncertain than they differ from it, and
+    where the frames are too few, so that different tones agree; their difference then counts as its standard deviation.
+
+    ``seen`` (A,) px are the standard deviations of the motion of rows between frames by noise, ``by_row_time`` (1, N,
+    G, A) px the changes of the displacements by the standard deviation of the row time.
     """
+    # 1. The tones of the rows.
     residual = residual_of_motion(measured, motion)
     interval = max(BLOCK_ROWS * timing.row_time, 0.5 * timing.exposure_time)
     rows = replace(measured, independent=measured.independent_fraction(residual))
@@ -609,14 +378,36 @@ def _agreeing_tones(measured: Measurements, motion: FreeMotion, timing: RowTimin
     fit = find_tones(rows, interval, start=single, least_gain=0.02)
     weighed = measured.weighed(residual_of(measured, fit))
     fit = fitted_again(weighed, fit)
+    # 2. The axes on which they agree with the spline.
     apart = (residual_of(measured, fit) - residual)[0][measured.visible[0] > 0]
-    agree = fit.active[0].any(-1) & (np.sqrt(np.square(apart).mean(0)) < _MAX_APART * of_noise)
-    return _Tones(fit, weighed, agree)
+    agree = fit.active[0].any(-1) & (np.sqrt(np.square(apart).mean(0)) < _MAX_APART * seen)
+    if not agree.any():
+        return motion, spread
+    # 3. Their standard deviation, with the allowance for a further one and for the row time.
+    of_noise = with_further_tones(weighed, fit, table(times).ravel() - 0.5 * weighed.exposure_time)[1]
+    changed = replace(weighed, displacements=weighed.displacements + by_row_time)
+    moved, shifted = (motion_of_fit(one)[0].displacement(times) for one in (fit, fit_tones(changed, fit, fit.active)))
+    change = table(shifted - moved)
+    of_tones = np.hypot(of_noise.displacement_std[0], change - change.mean((0, 1)))
+    # 4. The axes on which they are better.
+    difference = table(_with_tones_on(motion, fit, agree).displacement(times) - motion.displacement(times))
+    size = difference.std((0, 1))
+    uncertain, of_spline = (np.sqrt(np.square(values).mean((0, 1))) for values in (of_tones, spread.of_rows))
+    taken = agree & ((uncertain < of_spline) | (2 * uncertain < size))
+    taken &= fit.active[0].sum(-1) <= len(times) - _FRAMES_BESIDE
+    # 5. The motion and its standard deviations.
+    of_rows = np.where(taken, of_tones, np.hypot(spread.of_rows, size))
+    unseen = np.where(taken, uncertain, np.hypot(spread.unseen, size))
+    return _with_tones_on(motion, fit, taken), _Spread(of_rows, spread.seen, unseen)
 
 
-def _rms_of_rows(values: Array) -> Array:
-    """(A,) root mean square of values (T, R, A)."""
-    return np.sqrt(np.square(values).mean((0, 1)))
+def _with_tones_on(motion: FreeMotion, fit: ToneFit, axes: NDArray[np.bool_]) -> FreeMotion:
+    """The motion with tones and a straight line in place of the spline of some axes."""
+    tones = motion_of_fit(replace(fit, active=fit.active & axes[:, None]))[0]
+    knots, speed = motion.knots, motion.tones.image_motion
+    line = (tones.image_motion - speed)[:, None] * (knots - knots.mean())
+    coefficients = torch.where(torch.from_numpy(axes)[:, None], line, motion.coefficients)
+    return FreeMotion(coefficients, motion.start, motion.spacing, replace(tones, image_motion=speed))
 
 
 # --- Report ---
@@ -641,9 +432,9 @@ def _report(
     value, residual = motion.displacement(times), residual_of_motion(measured, motion)
     value = value - value.mean((0, 1))
     sudden = tensor(_sudden(measured, residual, table(times), motion.spacing))
-    std = torch.hypot(tensor(spread.of_rows), sudden)
-    std_seen = torch.hypot(tensor(spread.seen), sudden.square().mean((0, 1)).sqrt())
     unseen, rest = tensor(spread.unseen), tensor(measured.unexplained(residual)[0])
+    known = torch.hypot(tensor(spread.seen), sudden.square().mean((0, 1)).sqrt())
+    std, std_seen = torch.hypot(tensor(spread.of_rows), torch.hypot(sudden, rest)), torch.hypot(known, rest)
     # 2. The verdict.
     moved = (value - value.mean(0)).square().mean((0, 1)).sqrt()
     findings = []
@@ -654,8 +445,8 @@ def _report(
             against.insert(0, Reason("motion_unexplained", name, residual_of_axis, allowed))
         size = math.sqrt(2) * float(moved[axis] if scale.axes == 2 else moved[:2].amax())
         against += rotation_reasons(axis, scale.axes, apart.tolist(), size)
-        if float(std_seen[axis]) > _MAX_STD_SEEN:
-            against.append(Reason("motion_uncertain", name, float(std_seen[axis]), _MAX_STD_SEEN))
+        if float(known[axis]) > _MAX_STD_SEEN:
+            against.append(Reason("motion_uncertain", name, float(known[axis]), _MAX_STD_SEEN))
         limit = max(float(value[..., axis].square().mean().sqrt()), _MAX_STD_SEEN)  # of an axis that hardly moves
         if float(unseen[axis]) > limit:
             against.append(Reason("common_motion_uncertain", name, float(unseen[axis]), limit))

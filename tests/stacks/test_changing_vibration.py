@@ -1,0 +1,167 @@
+"""A vibration that changes is measured without tones, window by window, in stacks of any format."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import torch
+from program import rsvib
+from small_stack import stop_after
+from truth import Curve, crop, decibel, draw_scene, take_frames
+
+import rsvib_torch as rsv
+from rsvib_torch.stacks import detect_stack, read_manifest
+
+TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=12, frame_rows=500)
+CAMERA = ["--row-time", "100us", "--exposure", "1.2ms", "--frame-rate", "20"]
+FRAMES, DECAY = 30, 1.2  # s
+AMPLITUDE, FREQUENCY = np.array([2.3, 1.7]), np.array([66.3, 47.0])  # px, Hz
+PHASE = np.array([0.5, 1.2])
+SCENE = draw_scene(208, 208, seed=2)
+STILL = crop(SCENE)
+
+
+def steady(times):
+    return AMPLITUDE * np.sin(2 * np.pi * FREQUENCY * times[..., None] + PHASE)
+
+
+def decaying(times):
+    return np.exp(-times / DECAY)[..., None] * steady(times)
+
+
+@pytest.fixture(scope="module", name="place")
+def make_place(tmp_path_factory):
+    """A folder with a satellite pass, and the restored frames of a run."""
+    folder = tmp_path_factory.mktemp("pass")
+    np.save(folder / "frames.npy", take_frames(SCENE, TIMING, Curve(decaying), FRAMES, noise=0.003).astype(np.float32))
+    process(folder, folder / "out.npy")
+    return folder
+
+
+def process(folder, sink, **options):
+    options = {"restoration": {"method": "dewarp"}} | options
+    return rsv.process_stack(folder / "frames.npy", sink, TIMING, **options)
+
+
+def test_every_frame_of_a_vibration_that_decays_is_restored(place):
+    taken, restored = (np.load(place / name) for name in ("frames.npy", "out.npy"))
+    before, after = ([decibel(frame, STILL) for frame in stack] for stack in (taken, restored))
+    assert np.mean(np.subtract(after, before)) > 10
+    assert min(after) > 37  # of which the constant displacement, which no window knows, leaves most
+    manifest = read_manifest(place / "out.npy.manifest.json")
+    assert {record.outcome for record in manifest.windows} == {"helps"}
+
+
+def test_windows_state_equivalent_tones_and_their_motion(place):
+    manifest = read_manifest(place / "out.npy.manifest.json")
+    table = manifest.table()
+    assert all(table["reliable"])
+    envelope = np.exp(-np.array(table["middle_time_s"]) / DECAY)
+    windows = len(manifest.windows)
+    np.testing.assert_allclose(table["amplitude_px"], np.tile(AMPLITUDE, windows) * envelope, rtol=0.1)
+    np.testing.assert_allclose(table["frequency_Hz"], np.tile(FREQUENCY, windows), atol=1.0)
+    rows = (np.arange(128) + 0.5 * TIMING.exposure_rows) * TIMING.row_time
+    for record, motion in zip(manifest.windows, manifest.detections(), strict=True):
+        times = np.arange(record.last - record.first + 1)[:, None] * TIMING.frame_period + rows
+        error = motion.displacement(torch.from_numpy(times)).numpy() - decaying(times + record.start_time)
+        assert np.std(error - error.mean(0)) < 0.02  # of what differs between frames
+        assert np.std(error.mean(0) - error.mean((0, 1))) < 0.4  # of what six frames with gaps have in common
+
+
+def test_the_motions_of_a_manifest_restore_the_same_frames(place, tmp_path):
+    given = read_manifest(place / "out.npy.manifest.json").detections()
+    process(place, tmp_path / "out.npy", given=given)
+    np.testing.assert_array_equal(np.load(tmp_path / "out.npy"), np.load(place / "out.npy"))
+
+
+@pytest.mark.parametrize("joint", [True, 3])
+def test_windows_of_a_vibration_that_changes_are_restored_jointly(place, tmp_path, joint):
+    np.save(tmp_path / "frames.npy", np.load(place / "frames.npy")[:8])
+    process(tmp_path, tmp_path / "out.npy", restoration={"joint": joint})
+    assert min(decibel(frame, STILL) for frame in np.load(tmp_path / "out.npy")) > 37
+
+
+def test_the_frames_around_a_sudden_stop_are_restored(tmp_path):
+    """It stops in the middle of frame 11; no tones explain its rows, and frames behind it are at rest."""
+    stop = 11.3 * TIMING.frame_period
+    frames = take_frames(SCENE, TIMING, Curve(lambda t: decaying(t) * (t < stop)[..., None]), 20, noise=0.003)
+    np.save(tmp_path / "frames.npy", frames.astype(np.float32))
+    process(tmp_path, tmp_path / "out.npy")
+    restored = np.load(tmp_path / "out.npy")
+    assert min(decibel(restored[index], STILL) - decibel(frames[index], STILL) for index in range(11)) > 4
+    assert min(decibel(restored[index], STILL) for index in range(12, 20)) > 37
+
+
+def test_a_change_of_frequency_within_a_window_is_measured(tmp_path):
+    """A motor changes its speed within frame 4."""
+
+    def moved(times):
+        turned = 2 * np.pi * np.where(times < 4.4 * TIMING.frame_period, 0.0, [[-28.3], [-9.0]]).T
+        return AMPLITUDE * np.sin(turned * times[..., None] + 2 * np.pi * FREQUENCY * times[..., None] + PHASE)
+
+    frames = take_frames(SCENE, TIMING, Curve(moved), 8, noise=0.003)
+    np.save(tmp_path / "frames.npy", frames.astype(np.float32))
+    process(tmp_path, tmp_path / "out.npy")
+    restored = np.load(tmp_path / "out.npy")
+    gains = [decibel(restored[index], STILL) - decibel(frames[index], STILL) for index in range(8)]
+    assert min(gains) > 3  # of the frame whose displacement jumps
+    assert np.mean(gains) > 6
+
+
+def test_a_frame_at_rest_contradicts_the_tones_of_the_others():
+    """The rows of seven frames outweigh those of the last one, which restoration would make worse by 20 dB."""
+    stop = 7 * TIMING.frame_period - 1e-3
+    moved = Curve(lambda t: steady(t) * (t < stop)[..., None])
+    found = rsv.detect_vibration(take_frames(SCENE, TIMING, moved, 8, noise=0.003), TIMING)
+    assert not found.reliable.any()
+    assert all("rows_unexplained" in [one.code for one in of_axis] for of_axis in found.findings)
+
+
+def test_result_does_not_depend_on_interruptions_windows_at_once_or_workers(place, tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        process(place, tmp_path / "out.npy", progress=stop_after(12))
+    report = process(place, tmp_path / "out.npy", resume=True, workers=3)
+    assert 0 < report.resumed < report.windows
+    assert (tmp_path / "out.npy").read_bytes() == (place / "out.npy").read_bytes()
+    expected = json.loads((place / "out.npy.manifest.json").read_text())
+    assert json.loads((tmp_path / "out.npy.manifest.json").read_text()) == expected
+
+
+def test_bad_frames_are_written_as_taken_and_the_others_restored(place, tmp_path):
+    frames = np.load(place / "frames.npy")[:12]
+    frames[7] = np.float32(0.5)  # constant
+    np.save(tmp_path / "frames.npy", frames)
+    report = process(tmp_path, tmp_path / "out.npy")
+    assert (report.bad_frames, report.restored) == (1, report.windows)
+    restored = np.load(tmp_path / "out.npy")
+    np.testing.assert_array_equal(restored[7], frames[7])
+    assert min(decibel(restored[index], STILL) for index in (6, 8, 9)) > 36
+
+
+def test_windows_that_are_only_detected_state_their_motion(place, tmp_path):
+    detect_stack(place / "frames.npy[0:8]", tmp_path / "manifest.json", TIMING)
+    (record,) = read_manifest(tmp_path / "manifest.json").windows
+    assert (record.written, record.motion is not None) == (0, True)
+
+
+def test_run_restores_a_vibration_that_changes_without_an_option(place, tmp_path, capsys):
+    assert rsvib("run", place / "frames.npy", tmp_path / "run", *CAMERA, "--report") == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "the vibration changes within all windows" in shown
+    rows = list(csv.DictReader((tmp_path / "run" / "tones.csv").read_text().splitlines()))
+    sizes = [float(row["amplitude_px"]) for row in rows if row["axis"] == "x"]
+    assert sizes[0] > 2 * sizes[-1]
+    restored = rsv.read_stack(tmp_path / "run" / "restored.tif").numpy()
+    assert min(decibel(frame, STILL) for frame in restored) > 37
+    assert (tmp_path / "run" / "windows.png").exists()
+    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    assert "The vibration changes; it was measured and removed by rsvib run." in page
+
+
+def test_windows_are_measured_with_tones_only_if_options_of_detection_are_given(place, tmp_path):
+    report = rsv.process_stack(place / "frames.npy[0:8]", tmp_path / "out.npy", TIMING, detection={"tones": "auto"})
+    assert report.restored == 0
+    (record,) = read_manifest(report.manifest).windows
+    assert record.motion is None
+    assert "detect_motion if the vibration changes" in str(record.left_alone[0])
