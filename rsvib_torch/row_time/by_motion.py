@@ -22,16 +22,11 @@ from rsvib_torch.frames.entry_points import entry_point
 from rsvib_torch.frames.grey import grey_frames
 from rsvib_torch.frames.orientation import reasons_from_row_order
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.options import OffsetOptions
+from rsvib_torch.options import MaskedInputOptions, RegistrationOptions
 from rsvib_torch.results.reason import Reason
 from rsvib_torch.row_time import RowTimeCalibration
 from rsvib_torch.row_time.by_path import row_time_of_path
-from rsvib_torch.row_time.by_tones import (
-    CameraClock,
-    RowTimeFit,
-    bands_of_frames,
-    row_time_of_tones,
-)
+from rsvib_torch.row_time.by_tones import CameraClock, RowTimeFit, row_time_of_tones
 
 P = ParamSpec("P")
 
@@ -40,7 +35,7 @@ _SHORTEST_READOUT = 0.1  # of the frame period, if no row times are given
 
 
 @option_group
-class RowTimeOptions(OffsetOptions):
+class RowTimeOptions(RegistrationOptions, MaskedInputOptions):
     """Options of ``calibrate_row_time_by_motion``; bands are those of the start."""
 
     frame_rate: Positive
@@ -131,12 +126,9 @@ def calibrate_row_time_by_motion(frames: FramesOrFiles, options: RowTimeOptions)
         found = _undetermined(Reason("too_few_frames_for_row_time", None, num_frames, _MIN_FRAMES))
     else:
         with threads_for(stack.images):
-            by_path = row_time_of_path(stack, clock)
+            found = row_time_of_tones(stack, clock, options) or _undetermined(Reason("no_motion_for_row_time"))
+            by_path = row_time_of_path(stack, clock) if found.findings else None
             if by_path is not None:
-                clock = clock.near(by_path)
-            by_tones = row_time_of_tones(stack, clock, options, bands_of_frames(stack, clock, options))
-            found = by_tones or _undetermined(Reason("no_motion_for_row_time"))
-            if found.findings and by_path is not None:
                 found = by_path
                 notes.append("the motion is that of a hand or a flight: the path of corners over all rows")
     return _result(replace(found, findings=reasons_from_row_order(found.findings, sensor)), clock, notes)

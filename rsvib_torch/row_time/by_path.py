@@ -34,9 +34,6 @@ _SYSTEMATIC = 0.02
 # 1.03 of a drone, whose row time was 44 to 76 us in parts of its flight. Where tones are found beside the path, 16
 # recordings of tones alone have 1.04 to 2.5, and wrong row times; 9 of a hand 70 to 1000
 _MIN_CONTRAST, _MIN_CONTRAST_BESIDE_TONES = 1.15, 4.0
-# Cycles per frame above which a tone is fast, and the part of the variance of the second differences of a path that is
-# left beside it: less than 0.06 of tones that had wrong row times
-_SLOW, _NOT_A_TONE = 0.1, 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +108,7 @@ def row_time_of_path(stack: GreyFrames, clock: CameraClock) -> RowTimeFit | None
     window = followed.window(found[0])
     contrast = followed.squares(0.0, ())[0].mean() / followed.squares(found[0], ())[0].mean()
     least = _MIN_CONTRAST_BESIDE_TONES if window.tones else _MIN_CONTRAST
-    if contrast < least or _may_be_tone(window, clock.period):
+    if contrast < least:
         return None
     if window.tones:
         found = followed.minimum(found[0], [(tone.axis, tone.frequency) for tone in window.tones])
@@ -122,23 +119,6 @@ def row_time_of_path(stack: GreyFrames, clock: CameraClock) -> RowTimeFit | None
     if abs(nearest - row_time) > 2.0 * std:
         return None
     return RowTimeFit(nearest, std, permitted=_MAX_STD)
-
-
-def _may_be_tone(window: WindowPath, period: float) -> bool:
-    """Whether a path may be one fast tone, which continues from frame to frame as another one at another row time.
-
-    A tone of 49.5 Hz at 30 frames per second and 40 us continues as one of 19.5 Hz at 101.5 us. Slow motion would
-    continue as a fast tone at a row time below the limits only, and tones of several frequencies at one row time only.
-    """
-    count = int(2 * (window.origin - window.start) / period)
-    # the path turns within the frames by its second differences, from which the row time follows
-    turns = np.diff(window.path(window.start + period * np.arange(count))[:, :2], 2, axis=0)
-    turns = turns - turns.mean(0)
-    waves = np.exp(2j * math.pi * np.arange(_SLOW, 0.5, 0.2 / count) * np.arange(count - 2)[:, None])
-    best = waves[:, np.argmax(np.square(np.abs(waves.T @ turns)).sum(-1))]
-    design = np.stack([np.ones_like(best.real), best.real, best.imag], -1)
-    rest = turns - design @ np.linalg.lstsq(design, turns)[0]
-    return bool(np.square(rest).sum() < _NOT_A_TONE * np.square(turns).sum())
 
 
 def _followed(stack: GreyFrames, clock: CameraClock) -> _FollowedCorners | None:
