@@ -56,7 +56,7 @@ class BandFit:
     """Bands of period P rows: ``y_p(i) = s_p(i) (1 + sum_k Re[c_pk exp(-2 pi j k i / P)])``."""
 
     period: float  # P in rows
-    period_std: float  # its standard deviation in rows, from the residuals with their correlation
+    period_std: float  # its standard deviation in rows, from the residuals at frequencies beside it
     coefficients: Array  # (T, K) complex128, waveform of each frame over its mean
     # power of the fundamental over that of residuals at frequencies beside it, in all frames of a fixed scene together
     certainty: float
@@ -90,20 +90,6 @@ def _solve(matrix: Array, right: Array) -> Array:
 def _unexplained(matrix: Array, values: Array) -> Array:
     """Residual of a least-squares fit of (T, H, N) to (T, H)."""
     return values - (matrix @ _solve(matrix, values)[..., None])[..., 0]
-
-
-def _deviation(slope: Array, residual: Array, reach: int) -> float:
-    """Standard deviation of a fitted parameter, with the correlation of residuals within ``reach`` rows.
-
-    The derivatives of the model by it, without what other parameters explain, and the residuals are (T, H). Products
-    are weighted by Bartlett's window. The result is not smaller than for residuals without correlation.
-    """
-    information = max(float(np.square(slope).sum()), _TINY)
-    score, reach = slope * residual, min(reach, residual.shape[1] - 1)
-    window = 1 - np.abs(np.arange(-reach, reach + 1)) / (reach + 1)
-    correlated = float((score * ndimage.convolve1d(score, window, axis=1, mode="constant")).sum())
-    squares = max(correlated, float(np.square(score).sum()), float(np.square(residual).mean()) * information)
-    return math.sqrt(squares) / information
 
 
 def _fit_period(brightness: Array, start: float, scene: SceneModel) -> BandFit | None:
@@ -183,10 +169,9 @@ def _fit(brightness: Array, period: float, scene: SceneModel, count: int) -> Ban
         certainty /= frames
     values = brightness.size / _correlation_rows(residual)  # independent ones
     evidence = -0.5 * values * math.log(float((residual**2).mean()) + _TINY)
-    period_std = _deviation(leverage, residual, max(8, math.ceil(period)))
     return BandFit(
         period=period,
-        period_std=max(period_std, _period_std_beside(leverage, shift, certainty, period)),
+        period_std=_period_std_beside(leverage, shift, certainty, period),
         coefficients=coefficients,
         certainty=certainty,
         evidence=evidence - 0.5 * 2 * count * frames * math.log(values),
