@@ -160,22 +160,16 @@ def form_rows(
     node_weights: Tensor,
     frequencies: Tensor,
     degree: int,
-    *,
-    num_scenes: int = 1,
 ) -> Tensor:
     """Form rows of frames from the spectra of the rows of a scene, which is mirrored beyond its first and last row.
 
-    The ``spectra`` (..., S, U) are those of B-spline coefficients, of ``degree`` across the rows; the rows of several
-    scenes follow each other. ``places`` (..., R, N) are scene rows at the nodes of the exposures of R rows, and
-    ``along`` (..., R, N) displacements along the rows in px, (B, R, N) for several scenes; ``node_weights`` (N,) sum to
-    1; frequencies (U,) are in cycles per px.
+    The ``spectra`` (..., S, U) are those of B-spline coefficients, of ``degree`` across the rows. ``places`` (..., R,
+    N) are scene rows at the nodes of the exposures of R rows, and ``along`` (..., R, N) displacements along the rows in
+    px; ``node_weights`` (N,) sum to 1; frequencies (U,) are in cycles per px.
     """
     first, taps = row_taps(places, node_weights, partial(bspline_weights, degree=degree))
     source = first[..., None] + torch.arange(-(degree // 2), taps.shape[-2] - degree // 2, device=first.device)
-    num_rows = spectra.shape[-2] // num_scenes
-    source = mirrored(source, num_rows)
-    if num_scenes > 1:
-        source = source + num_rows * torch.arange(num_scenes, device=source.device)[:, None, None]
+    source = mirrored(source, spectra.shape[-2])
     transfer = row_transfer(taps, along, frequencies).to(spectra.dtype)
     # sum over the taps of each row
     return (spectra[..., source, :] * transfer).sum(-2)

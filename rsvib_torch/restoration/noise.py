@@ -21,9 +21,8 @@ from rsvib_torch.frames.pixels import cut_parts
 from rsvib_torch.numerics.fourier import squared_modulus
 from rsvib_torch.numerics.tables import Array, constant, median, quantile, table, tables, valid_mean, without_nan
 from rsvib_torch.restoration.frame_motion import FrameMotion
-from rsvib_torch.restoration.scene_model.cross_validation import sample_rows
-from rsvib_torch.restoration.scene_model.observation import RowKernels
-from rsvib_torch.restoration.scene_model.scene_prior import cut_pieces, spread_starts, taper
+from rsvib_torch.restoration.observation import RowKernels
+from rsvib_torch.restoration.scene_prior import cut_pieces, sample_rows, spread_starts, taper
 
 # Squares for power spectra, and which parts of images count
 

@@ -12,9 +12,9 @@ from truth import decibel, draw_scene
 import rsvib_torch as rsv
 from rsvib_torch.frames.mosaic import colour_frames, is_mosaic
 from rsvib_torch.restoration import RestorationWarning
-from rsvib_torch.restoration.exact.mosaic_scene import MosaicSolver
+from rsvib_torch.restoration.finer_grid import FinerObservation, PolynomialPrior
 from rsvib_torch.restoration.frame_motion import frame_motion
-from rsvib_torch.restoration.scene_model.finer_grid import FinerObservation, PolynomialPrior
+from rsvib_torch.restoration.mosaic_scene import MosaicSolver
 
 SIZE, MARGIN, NOISE = 72, 24, 0.003
 

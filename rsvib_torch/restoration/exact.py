@@ -22,29 +22,32 @@ from rsvib_torch.execution.progress import steps
 from rsvib_torch.numerics.fourier import extend_rows
 from rsvib_torch.numerics.tables import table, tables, take_stacks
 from rsvib_torch.options import ExactOptions
-from rsvib_torch.restoration.exact.filling import (
-    FILLED_BLUR_REACH,
-    measured_values,
-    scene_period,
-    with_extension,
-    with_missing_values,
+from rsvib_torch.restoration.finer_grid import (
+    GRIDS,
+    FrameDifference,
+    PolynomialPrior,
+    finer_scene,
+    fit_polynomial_prior,
+    warn_of_frames,
 )
-from rsvib_torch.restoration.exact.finer_scene import FrameDifference, finer_scene, warn_of_frames
-from rsvib_torch.restoration.exact.mosaic_scene import restore_mosaic
-from rsvib_torch.restoration.exact.priors import PRIORS, check_prior
-from rsvib_torch.restoration.exact.scene_solver import (
+from rsvib_torch.restoration.frame_motion import MovingFrames, joint_groups
+from rsvib_torch.restoration.mosaic_scene import restore_mosaic
+from rsvib_torch.restoration.noise import noise_levels
+from rsvib_torch.restoration.observation import SCENE_REACH, TAPS, RowKernels
+from rsvib_torch.restoration.priors import PRIORS, check_prior
+from rsvib_torch.restoration.scene_prior import RowPrior, brightness, fit_prior, prior_strengths
+from rsvib_torch.restoration.scene_solver import (
+    FILLED_BLUR_REACH,
     MIN_LEVEL,
     MOST_THREADS,
     SceneProblem,
+    measured_values,
     most_values,
+    scene_period,
     solver_threads,
+    with_extension,
+    with_missing_values,
 )
-from rsvib_torch.restoration.frame_motion import MovingFrames, joint_groups
-from rsvib_torch.restoration.noise import noise_levels
-from rsvib_torch.restoration.scene_model.cross_validation import prior_strengths
-from rsvib_torch.restoration.scene_model.finer_grid import GRIDS, PolynomialPrior, fit_polynomial_prior
-from rsvib_torch.restoration.scene_model.observation import SCENE_REACH, TAPS, RowKernels
-from rsvib_torch.restoration.scene_model.scene_prior import RowPrior, brightness, fit_prior
 
 _FRAME_BYTES = 2**26  # frames of scenes that are treated at a time on a CPU, beside the systems
 
