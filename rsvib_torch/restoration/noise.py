@@ -150,13 +150,8 @@ def noise_of_frame_pair(frames: Tensor, motion: FrameMotion, ignore: Tensor | No
                 pairs[stack] = members, step
     if not pairs:
         return result
-    # rows and columns of the scene that both frames contain, of all stacks or else of one stack after the other
+    # rows and columns of the scene that both frames of all stacks contain: along each axis, a stack has at least as many
     common = size - np.abs([step for _, step in pairs.values()]).max(0)
-    if min(common) < least:
-        for stack in pairs:
-            missing = None if ignore is None else ignore[[stack]]
-            result[[stack]] = noise_of_frame_pair(frames[[stack]], motion.of([stack]), missing, high_pass[[stack]])
-        return result
     num_rows, columns = min(common[0], 256), common[1]  # from the middle: more rows hardly lower the variance
     stacks = list(pairs)
     members = np.stack([members for members, _ in pairs.values()])  # (S, 2)

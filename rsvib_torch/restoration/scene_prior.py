@@ -334,7 +334,6 @@ def sample_rows(images: Tensor, kernels: RowKernels, chosen: NDArray[np.int64]) 
 
 
 _STRENGTHS = np.array([2.0, 1.0, 0.5, 0.25, 0.12, 0.06, 0.03])  # factors on the prior, from strong to weak
-_TRIED = 4  # of them, first
 _FREQUENCIES = 24  # at which rows are sampled
 _ROWS = 512  # sampled, from the middle of the frames
 
@@ -364,27 +363,20 @@ def prior_strengths(
     sample = sample_rows(images[..., top : top + count, :], kernels.rows(top, count), chosen)
     place = torch.from_numpy(np.rint(chosen / width * 2 * (prior.power.shape[-1] - 1)).astype(np.int64))
     at = RowPrior(*(values[..., place.to(values.device)] for values in vars(prior).values()))
-    # 2. A stronger prior is allowed only if the noise level is certain, and can be distinguished from the interpolation
-    # error of the kernel. The strongest priors are tried first, and all only if the weakest of them is selected.
+    # 2. ``n |r|^2 / (n - freedom)^2`` of Craven and Wahba (1979) estimates the squared error of predicting a pixel from
+    # all others. The sum over the frequencies is dominated by those with the largest errors; the geometric mean gives all
+    # the same weight.
+    precisions = [at.precision(noise_power, strength, blur_reach) for strength in _STRENGTHS.tolist()]
+    power, rest = sample.unexplained(torch.stack(precisions))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        of_sum = np.log(power.sum(-1)) - 2 * np.log(rest.sum(-1))
+        geometric = (np.log(power) - 2 * np.log(rest)).mean(-1)
+    # 3. A stronger prior is allowed only if the noise level is certain, and can be distinguished from the interpolation
+    # error of the kernel. Strength 1 follows from the noise level: another must reduce the logarithm by a handicap per
+    # octave. The weaker of the two selected priors is used, as it has the smaller error.
     above = table(noise_power)[:, 0] > 200.0 * table(prior.interpolation_power.mean((1, 2)))
     allowed = (above & certain) | (_STRENGTHS[:, None] <= 1.0)
     octaves = np.log2(_STRENGTHS)[:, None]
-    # strength 1 follows from the noise level: another must reduce the logarithm by this much per octave, weaker or
-    # stronger
     handicap = np.maximum(-0.014 * octaves, 0.002 * octaves)
-    selected = np.full(len(images), _TRIED - 1)
-    for tried in (_TRIED, len(_STRENGTHS)):
-        open_scenes = selected == _TRIED - 1
-        if not open_scenes.any():
-            break
-        # ``n |r|^2 / (n - freedom)^2`` of Craven and Wahba (1979) estimates the squared error of predicting a pixel
-        # from all others. The sum over the frequencies is dominated by those with the largest errors; the geometric
-        # mean gives all the same weight. The weaker of the two selected priors is used, as it has the smaller error.
-        precisions = [at.precision(noise_power, strength, blur_reach) for strength in _STRENGTHS[:tried].tolist()]
-        power, rest = sample.unexplained(torch.stack(precisions))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            of_sum = np.log(power.sum(-1)) - 2 * np.log(rest.sum(-1))
-            geometric = (np.log(power) - 2 * np.log(rest)).mean(-1)
-        criteria = (np.where(allowed[:tried], values + handicap[:tried], np.inf) for values in (of_sum, geometric))
-        selected = np.where(open_scenes, np.maximum(*(criterion.argmin(0) for criterion in criteria)), selected)
-    return _STRENGTHS[selected]
+    selected = [np.where(allowed, values + handicap, np.inf).argmin(0) for values in (of_sum, geometric)]
+    return _STRENGTHS[np.maximum(*selected)]
