@@ -22,7 +22,6 @@ from rsvib_torch.numerics.fourier import extend_rows
 from rsvib_torch.numerics.tables import table, take_stacks
 from rsvib_torch.options import ExactOptions
 from rsvib_torch.restoration.finer_grid import (
-    GRIDS,
     FrameDifference,
     PolynomialPrior,
     finer_scene,
@@ -32,7 +31,7 @@ from rsvib_torch.restoration.finer_grid import (
 from rsvib_torch.restoration.frame_motion import MovingFrames, joint_groups
 from rsvib_torch.restoration.mosaic_scene import restore_mosaic
 from rsvib_torch.restoration.noise import noise_levels
-from rsvib_torch.restoration.observation import SCENE_REACH, TAPS, RowKernels
+from rsvib_torch.restoration.observation import SCENE_REACH, TAPS, Observation, RowKernels
 from rsvib_torch.restoration.priors import PRIORS, check_prior
 from rsvib_torch.restoration.scene_prior import RowPrior, brightness, fit_prior, prior_strengths
 from rsvib_torch.restoration.scene_solver import (
@@ -146,7 +145,8 @@ class FrameModel(MovingFrames):
         shift = torch.as_tensor(scenes.shift[:, :, None, None], device=displacement.device)
         weights = self.weights[index] * torch.as_tensor(scenes.contributes, device=displacement.device)
         moved = (displacement[index] - shift).flatten(0, 1)
-        return GRIDS[self.scale].kernels_of_rows(moved, node_weights, weights.flatten(), self.images.shape[-2])
+        height = self.images.shape[-2]
+        return RowKernels.of_rows(moved, node_weights, weights.flatten(), height, points=self.scale)
 
     def strengths(self, scenes: Scenes) -> NDArray[np.float64]:
         """Factors (N,) on the priors: one for each stack, or strips of the same frames, estimated from its first scene.
@@ -200,7 +200,7 @@ class FrameModel(MovingFrames):
 
         # Observation operator, and precision of the prior.
         kernels = self._row_kernels(scenes)
-        observation = GRIDS[self.scale](kernels, self.images.shape[-2], self.period, data.dtype, len(data))
+        observation = Observation(kernels, self.images.shape[-2], self.period, data.dtype, len(data))
         level = self.level[stack_of]
         if isinstance(self.prior, RowPrior):
             factors = np.stack([scenes.strength, scenes.blur_reach])[..., None]

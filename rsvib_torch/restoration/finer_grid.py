@@ -1,13 +1,7 @@
-"""The grid of half pixels: observation operator of frames that alias, and the prior of its scenes.
+"""The grid of half pixels: the prior of its scenes, their solution, and what their frames reveal about the motion.
 
-On the finer grid, the scene after optics and pixel contains detail beyond half a cycle per pixel. Along the rows, the
-spectrum of a frame at u (0 ... 1/2 cycles per px) is the sum of the spectra of the scene at u and at its alias u - 1,
-which have different kernels: ``K_a(u) = sum_n w_n h(. - 2 y_n) exp(-2 pi i (u - a) x_n)`` for a = 0, 1. Across the
-rows, the scene is a cubic B-spline h with a knot every half row. Unknowns are numbered 2 j + a for row j of the
-coefficients, so that the normal equations are one banded system per u. Relative to the middle x of a row, the alias has
-the phase ``exp(2 pi i x)``, which does not depend on u: kernels are smooth in u, as on the pixel grid.
-
-``PolynomialPrior`` has a precision that is a polynomial in the Laplacians of both axes.
+``PolynomialPrior`` has a precision that is a polynomial in the Laplacians of both axes. If the frames of a scene differ
+from their model, more noise is assumed.
 
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
@@ -15,133 +9,16 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import cache, partial
 from math import pi
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from rsvib_torch.numerics.fourier import squared_modulus
-from rsvib_torch.numerics.splines import bspline_weights
 from rsvib_torch.restoration.frame_motion import FrameMotion, warn_of_restoration
-from rsvib_torch.restoration.observation import (
-    Observation,
-    RowKernels,
-    SmoothBand,
-    cosine_series,
-    interpolation_matrix,
-    normal_matrices,
-)
+from rsvib_torch.restoration.observation import SCALE, kernel_spectrum
 from rsvib_torch.restoration.scene_prior import observed_spectrum, smeared
 from rsvib_torch.restoration.scene_solver import SceneProblem
-
-SCALE = 2  # points per px of the finer grid, and unknowns per frequency
-_FINER_DEGREE = 3
-_FINER_SCENE_REACH = 5  # half rows on either side; support of the weights of a scene row on the finer grid
-
-
-class FinerKernels(RowKernels):
-    """Kernels on the grid of half pixels: ``first`` and ``taps`` count unknowns 2 j + a."""
-
-    symmetric = False
-    points = SCALE
-    interpolated = partial(bspline_weights, degree=_FINER_DEGREE)
-    before = _FINER_DEGREE // 2
-
-    @property
-    def blurred(self) -> bool:
-        """Whether the displacement changes by more than 1 px during an exposure."""
-        return max(2.0 * self.blur_reach, (self.taps.shape[-2] / SCALE - _FINER_DEGREE - 1) / SCALE) > 1.0
-
-    def needed(self, num_rows: int) -> tuple[int, int]:
-        """First coefficient, and the one after the last, that the scene on the rows of a frame depends on."""
-        return -SCALE * _FINER_SCENE_REACH, SCALE * (SCALE * num_rows + _FINER_SCENE_REACH)
-
-    def at(self, frequencies: Tensor) -> Tensor:
-        """Kernels (M, R, 2 J, Q) without the phase of the middle at the frequency."""
-        both = torch.stack([frequencies, frequencies - 1])  # (a, Q)
-        angle = (-2 * math.pi) * self.along[..., None, :, None] * both[:, None]
-        alias = (2 * math.pi) * self.middle[..., None, None] * both.new_tensor([[0.0], [1.0]])
-        waves = torch.polar(torch.ones_like(angle), angle + alias[..., None])  # (M, R, a, N, Q)
-        taps = self.taps.unflatten(-2, (-1, SCALE)).transpose(-3, -2)  # (M, R, a, J, N)
-        return (taps.to(waves.dtype) @ waves).transpose(-3, -2).flatten(-3, -2)
-
-
-def _spline_transfer(frequencies: Tensor) -> Tensor:
-    """Transfer function of the cubic B-spline on half pixels, at frequencies in cycles per px."""
-    return torch.sinc(frequencies / SCALE) ** (_FINER_DEGREE + 1)
-
-
-@cache
-def _finer_scene_weights() -> tuple[float, ...]:
-    """Weights of the coefficients of half rows -5 ... 5 in a row of the scene, as ``scene_weights``.
-
-    The least-squares fit to ``_spline_transfer`` up to 0.9 cycles per px. Samples of the spline, weights 1/6, 4/6 and
-    1/6, include its aliases: gratings across the rows have 1.14 times their contrast at 0.75 cycles per px.
-    """
-    v = np.linspace(0, 0.9, 181)
-    half = cosine_series(2 * pi / SCALE * v, _spline_transfer(torch.from_numpy(v)).numpy(), _FINER_SCENE_REACH)
-    return tuple((np.concatenate([half[:0:-1], half]) / (half[0] + 2 * half[1:].sum())).tolist())
-
-
-@dataclass(frozen=True, eq=False)
-class FinerBand(SmoothBand):
-    """Normal matrices at any frequencies; the prior is ``sum_m q_m(u - a) T^m`` with the Laplacian T across rows.
-
-    ``left`` contains the bands of ``T^m`` for both aliases behind the real and imaginary parts at the nodes.
-    """
-
-    def at(self, u: Tensor, precision: Tensor) -> Tensor:
-        """Skewed bands as in ``SmoothBand.at``, for a precision (p + 1, 2, U) as of ``PolynomialPrior.precision``."""
-        prior = torch.stack([precision, torch.zeros_like(precision)], dim=-1).flatten(-2).flatten(0, 1)
-        interpolation = interpolation_matrix(self.reach, u, self.left.dtype, symmetric=False)[1]
-        right = torch.cat([interpolation.to(prior), prior])
-        return torch.view_as_complex(self._product(right)).flatten(2)
-
-
-def _laplacian_powers(count: int, order: int, device: torch.device) -> Tensor:
-    """Bands (K, 2 p + 1, p + 1) of ``T^0 ... T^p``, ``[k, p + d] = T^m[k, k + d]``, T with mirrored ends."""
-    step = torch.full((count, 3), -1.0, dtype=torch.float64, device=device)  # T[k, k - 1], T[k, k], T[k, k + 1]
-    step[0, 0] = step[-1, 2] = 0.0
-    step[:, 1] = -step[:, 0] - step[:, 2]
-    powers = [torch.zeros(count, 2 * order + 1, dtype=torch.float64, device=device)]
-    powers[0][:, order] = 1.0
-    for _ in range(order):
-        above, here, below = (step[:, 1 + f, None] * powers[-1].roll((-f, f), (0, 1)) for f in (-1, 0, 1))
-        powers.append(above + here + below)
-    return torch.stack(powers, dim=-1)
-
-
-class FinerObservation(Observation):
-    """``Observation`` of one scene on the grid of half pixels; all values count unknowns 2 j + a."""
-
-    kernels_of_rows = FinerKernels.of_rows
-
-    def normal(self, order: int) -> SmoothBand:
-        """Normal matrices ``K^H W K``, with room for a polynomial of an order in the Laplacian across rows."""
-        if order not in self._normal:
-            width = max(self.kernels.taps.shape[-2] - 1, SCALE * order)
-            matrices = normal_matrices(self.kernels, self.top, self.count, width, self.dtype)[:, :, 0]
-            powers = _laplacian_powers(self.count // SCALE, order, matrices.device)
-            prior = matrices.new_zeros(*matrices.shape[:2], order + 1, SCALE)
-            for alias in range(SCALE):
-                place = slice(width - SCALE * order, width + SCALE * order + 1, SCALE)
-                prior[alias : self.count : SCALE, place, :, alias] = powers
-            left = torch.cat([matrices, prior.flatten(2)], dim=-1).to(self.dtype)
-            self._normal[order] = FinerBand(left[:, :, None], 2 * self.kernels.blur_reach)
-        return self._normal[order]
-
-    def image(self, coefficients: Tensor) -> Tensor:
-        """The scene at half pixels, (1, C, 2 R, 2 L): rows j / 2 and columns i / 2 of the frame at rest."""
-        first = -SCALE * _FINER_SCENE_REACH - self.top
-        count = SCALE * self.num_rows
-        rows = coefficients[first : first + SCALE * (count + 2 * _FINER_SCENE_REACH)].unflatten(0, (-1, SCALE))
-        weighted = [weight * rows[k : k + count] for k, weight in enumerate(_finer_scene_weights())]
-        low, alias = sum(weighted[1:], start=weighted[0]).unbind(1)  # at u and u - 1; the scene is real
-        spectra = torch.cat([low, alias[..., :-1].flip(-1).conj()], dim=-1)
-        return torch.fft.irfft(spectra.permute(2, 1, 0, 3), n=SCALE * self.period) * SCALE
-
 
 # Degree 6 instead of 4: 0.6 to 1.0 dB for eight frames of scenes with little detail beyond half a cycle per px, -0.4 dB
 # for one with much; 8 gains less than 0.2 dB more (drawn scenes of three sharpnesses, noise 0.002).
@@ -224,7 +101,7 @@ def fit_polynomial_prior(frames: Tensor, motion: FrameMotion, levels: Tensor, le
             along, across = u - alias_u, (v - alias_v).clamp(-1, 1)
             blur = smeared(spectrum.blur(spectrum.u - alias_u, spectrum.v - alias_v))[0]
             blur = (weight * blur).sum((0, 1)).masked_fill(beyond, 0.0)
-            gains.append(blur * _pixel(along) * _spline_transfer(across).square())
+            gains.append(blur * _pixel(along) * kernel_spectrum(across, SCALE).square())
             rows = _laplacian(across)[:, None] ** order @ rising.T
             features.append(torch.stack([rows[:, m] * _laplacian(along) ** n for m, n in _POWERS], dim=-1))
     gain, feature = torch.stack(gains), torch.stack(features)  # (aliases, U, V), (aliases, U, V, powers)
@@ -252,10 +129,6 @@ def fit_polynomial_prior(frames: Tensor, motion: FrameMotion, levels: Tensor, le
     for (m, n), log in zip(_POWERS, logs, strict=True):
         coefficients[m, n] = log.exp()
     return PolynomialPrior(rising.T @ coefficients, length)
-
-
-# Operators, for the points of the scene per px
-GRIDS: dict[int, type[Observation]] = {1: Observation, SCALE: FinerObservation}
 
 
 _BLOCK = 16  # rows of a frame whose displacement error is measured together

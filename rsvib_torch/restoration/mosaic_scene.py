@@ -15,9 +15,10 @@ from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.mosaic import interpolated_colours, measures
 from rsvib_torch.numerics.fourier import extend_rows
 from rsvib_torch.options import ExactOptions
-from rsvib_torch.restoration.finer_grid import SCALE, FinerObservation, fit_polynomial_prior, phase_spread
+from rsvib_torch.restoration.finer_grid import fit_polynomial_prior, phase_spread
 from rsvib_torch.restoration.frame_motion import FrameMotion, MovingFrames, joint_groups, warn_of_restoration
 from rsvib_torch.restoration.noise import noise_levels
+from rsvib_torch.restoration.observation import SCALE, Observation, RowKernels
 from rsvib_torch.restoration.priors import check_prior
 from rsvib_torch.restoration.scene_solver import MIN_LEVEL, SceneSolver, measured_values, scene_period
 
@@ -47,7 +48,7 @@ class MosaicSolver:
     ``precisions`` P_k are as from ``PolynomialPrior.precision``.
     """
 
-    def __init__(self, observation: FinerObservation, weights: Tensor, precisions: list[Tensor]) -> None:
+    def __init__(self, observation: Observation, weights: Tensor, precisions: list[Tensor]) -> None:
         self._observation, self._weights, self._precisions = observation, weights, precisions
         inside = (weights > 0).any(1, keepdim=True)
         self._inside = inside.to(weights.dtype)
@@ -163,8 +164,8 @@ def restore_mosaic(given: MovingFrames, colours: Tensor, options: ExactOptions) 
             )
             if len(members) == 1 or _same_colours(moved.detach(), node_weights):
                 part = part.demosaiced(mosaic[members], measures(colours[stack][:1])[0])
-            kernels = FinerObservation.kernels_of_rows(moved, node_weights, frames.new_ones(len(members)), height)
-            observation = FinerObservation(kernels, height, length, frames.dtype)
+            kernels = RowKernels.of_rows(moved, node_weights, frames.new_ones(len(members)), height, points=SCALE)
+            observation = Observation(kernels, height, length, frames.dtype)
             images.append(part.restored(observation, shift[:, 0], options))
             advance()
     return torch.stack(images).unflatten(0, (-1, len(groups)))
@@ -190,7 +191,7 @@ class _Frames:
         images = similar_patches(self.images, values, pattern, self.level, rounds=8, steps=6)
         return replace(self, images=images, measured=torch.ones_like(self.measured), floor=None, level=self.level / 2)
 
-    def restored(self, observation: FinerObservation, along: Tensor, options: ExactOptions) -> Tensor:
+    def restored(self, observation: Observation, along: Tensor, options: ExactOptions) -> Tensor:
         """Colours (3, scale H, scale W) of the scene.
 
         ``along`` (M,) are px by which the frames are moved along the rows relative to the restored one. An unknown
@@ -243,7 +244,7 @@ class _Frames:
         return pixel_shuffle(torch.cat(points).movedim(0, 1).flatten(0, 1), scale)
 
     def _precisions(
-        self, images: Tensor, observation: FinerObservation, level: Tensor, regularisation: float
+        self, images: Tensor, observation: Observation, level: Tensor, regularisation: float
     ) -> list[Tensor]:
         """Precision of the prior of each component, fitted to frames (M, 3, H, W)."""
         levels = level.expand(len(images))

@@ -150,7 +150,7 @@ def noise_of_frame_pair(frames: Tensor, motion: FrameMotion, ignore: Tensor | No
                 pairs[stack] = members, step
     if not pairs:
         return result
-    # rows and columns of the scene that both frames of all stacks contain: along each axis, a stack has at least as many
+    # rows and columns of the scene that both frames of all stacks contain: at least as many as needed
     common = size - np.abs([step for _, step in pairs.values()]).max(0)
     num_rows, columns = min(common[0], 256), common[1]  # from the middle: more rows hardly lower the variance
     stacks = list(pairs)
@@ -195,7 +195,7 @@ def _residual_power(images: Tensor, displacement: Tensor, node_weights: Tensor) 
     """
     num_rows, width = images.shape[-2:]
     moved = displacement.flatten(0, 1)
-    kernels = RowKernels.of_rows(moved, node_weights, moved.new_ones(len(moved)), num_rows, 4 * _MIN_SIDE)
+    kernels = RowKernels.of_rows(moved, node_weights, moved.new_ones(len(moved)), num_rows, margin=4 * _MIN_SIDE)
     count = min(24, width // 4)
     chosen = np.linspace(width // 4, width // 2, count, dtype=np.float32).astype(np.int64)
     sample = sample_rows(images, kernels, chosen)

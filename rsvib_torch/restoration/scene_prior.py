@@ -364,8 +364,8 @@ def prior_strengths(
     place = torch.from_numpy(np.rint(chosen / width * 2 * (prior.power.shape[-1] - 1)).astype(np.int64))
     at = RowPrior(*(values[..., place.to(values.device)] for values in vars(prior).values()))
     # 2. ``n |r|^2 / (n - freedom)^2`` of Craven and Wahba (1979) estimates the squared error of predicting a pixel from
-    # all others. The sum over the frequencies is dominated by those with the largest errors; the geometric mean gives all
-    # the same weight.
+    # all others. The sum over the frequencies is dominated by those with the largest errors; the geometric mean gives
+    # all the same weight.
     precisions = [at.precision(noise_power, strength, blur_reach) for strength in _STRENGTHS.tolist()]
     power, rest = sample.unexplained(torch.stack(precisions))
     with np.errstate(divide="ignore", invalid="ignore"):
