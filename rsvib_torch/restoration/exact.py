@@ -308,7 +308,7 @@ def _blocks(model: FrameModel, scenes: Scenes) -> list[tuple[str, list[int]]]:
     frequencies, rows = model.period // 2 + 1, height + 2 * SCENE_REACH
     across = math.ceil(float(model.motion.blur_lengths[..., 1].max()))
     systems = rows * (2 * (TAPS - 1 + across) + 1) * frequencies
-    most = most_values(rows, frequencies, device, blurred=False, single=False) // systems
+    most = most_values(device) // systems
     scene_bytes = 4 * scenes.members.shape[1] * model.images.shape[2] * height * model.period
     most = max(1, min(most, at_once(scene_bytes, device, cpu_bytes=_FRAME_BYTES)))
     threads = solver_threads(device)

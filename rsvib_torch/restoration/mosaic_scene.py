@@ -3,7 +3,6 @@
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
-from dataclasses import dataclass, replace
 from itertools import product
 
 import torch
@@ -130,7 +129,7 @@ def restore_mosaic(given: MovingFrames, colours: Tensor, options: ExactOptions) 
     of one frame is too low rather than too high.
     """
     # 1. Check the options, and list the frames of each result.
-    frames, motion, ignore, clipped = given.images, given.motion, given.ignore, given.clipped
+    frames, motion = given.images, given.motion
     height, width = frames.shape[-2:]
     check_prior(options.prior, scale=options.scale, mosaic=True)
     groups = joint_groups(frames.shape[1], options.joint)
@@ -143,117 +142,97 @@ def restore_mosaic(given: MovingFrames, colours: Tensor, options: ExactOptions) 
         # 3. The colours of a stack, interpolated where they are not measured, and the level of its noise.
         measured = measures(colours[stack])
         linear = interpolated_colours(mosaic, colours[stack])
-        floor = None if clipped is None else torch.where(measured & clipped[stack], mosaic, -torch.inf)
-        if ignore is not None:
-            measured = measured & ~ignore[stack]
+        floor = None if given.clipped is None else torch.where(measured & given.clipped[stack], mosaic, -torch.inf)
+        if given.ignore is not None:
+            measured = measured & ~given.ignore[stack]
         if options.noise == "auto":  # of colours whose noise was halved by interpolation
             level = 2 * noise_levels(linear.detach()[None], motion.of([stack])).square().mean().sqrt()
         else:
             level = torch.as_tensor(max(options.noise, MIN_LEVEL), dtype=frames.dtype, device=frames.device)
-        # 4. The scene of each group of frames; its colours are interpolated first if the frames do not determine them.
         for members, reference in groups:
-            shift = motion.shift[stack, members] - motion.shift[stack, reference]
+            # 4. Colours are interpolated first if the frames of a scene do not determine them; this halves their noise.
+            part = (linear[members], measured[members], None if floor is None else floor[members], level)
             moved = displacement[stack, members] - motion.shift[stack, reference]
-            part = _Frames(
-                linear[members],
-                measured[members],
-                None if floor is None else floor[members],
-                level,
-                motion.of([stack], members),
-                length,
-            )
             if len(members) == 1 or _same_colours(moved.detach(), node_weights):
-                part = part.demosaiced(mosaic[members], measures(colours[stack][:1])[0])
-            kernels = RowKernels.of_rows(moved, node_weights, frames.new_ones(len(members)), height, points=SCALE)
+                values, pattern = mosaic[members].expand_as(part[0]), measures(colours[stack][:1])[0]
+                filled = similar_patches(part[0], values, pattern, level, rounds=8, steps=6)
+                part = (filled, torch.ones_like(part[1]), None, level / 2)
+            # 5. The observation operator, and the scene.
+            of_frames, weight = motion.of([stack], members), frames.new_ones(len(members))
+            kernels = RowKernels.of_rows(moved, node_weights, weight, height, points=SCALE)
             observation = Observation(kernels, height, length, frames.dtype)
-            images.append(part.restored(observation, shift[:, 0], options))
+            along = of_frames.shift[0, :, 0] - motion.shift[stack, reference, 0]
+            images.append(_scene(*part, of_frames, observation, along, options))
             advance()
     return torch.stack(images).unflatten(0, (-1, len(groups)))
 
 
-@dataclass(frozen=True, eq=False)
-class _Frames:
-    """Frames of one scene."""
+def _scene(
+    images: Tensor,
+    known: Tensor,
+    floor: Tensor | None,
+    level: Tensor,
+    motion: FrameMotion,
+    observation: Observation,
+    along: Tensor,
+    options: ExactOptions,
+) -> Tensor:
+    """Colours (3, scale H, scale W) of the scene of frames (M, 3, H, W), whose colours are ``known`` or interpolated.
 
-    images: Tensor  # (M, 3, H, W) colours, measured or interpolated
-    measured: Tensor  # (M, 3, H, W) bool
-    floor: Tensor | None  # (M, 3, H, W) lower bounds of saturated colours, else -inf; None for none
-    level: Tensor  # standard deviation of the noise
-    motion: FrameMotion  # motion of these frames, a batch of one
-    length: int  # L, the period of the rows in px
+    ``floor`` (M, 3, H, W) are lower bounds of saturated colours, else -inf, ``level`` is that of the noise, and
+    ``along`` (M,) are px by which the frames are moved along the rows relative to the restored one. An unknown noise
+    level is estimated from the residual of the first fit, if there are several frames.
+    """
+    # 1. Deviations from the mean, extended to the period, and the weights of the measured and of the filled values.
+    count, width, scale, length = len(images), images.shape[-1], options.scale, observation.period
+    mean = images.mean((0, 2, 3))[:, None, None]
+    data = extend_rows(images - mean, length)
+    inside = measured_values(along[None], None, data[None].shape, width, ends=True)[0]
+    nowhere = ~known.any(1, keepdim=True)
+    measured, filled = (pad(mask, (0, length - width)) & inside for mask in (known, nowhere))
+    full = images.detach()
 
-    def demosaiced(self, mosaic: Tensor, pattern: Tensor) -> "_Frames":
-        """Frames whose colours are all interpolated, and count as measured; their noise is halved.
+    def solver(strength: float) -> MosaicSolver:
+        """With priors of the components fitted to ``full`` frames."""
+        weights = measured.to(data.dtype).masked_fill(filled, _FILLED)
+        levels, reach = level.expand(1, count), observation.kernels.blur_reach
+        priors = (
+            fit_polynomial_prior(component[None, :, None], motion, levels, length)
+            for component in _components(full - mean).unbind(1)
+        )
+        precisions = [prior.precision(level.square(), strength, reach) for prior in priors]
+        return MosaicSolver(observation, weights, precisions)
 
-        ``pattern`` (3, H, W) is the colour that each pixel of the mosaic (M, 1, H, W) measures.
-        """
-        values = mosaic.expand_as(self.images)
-        images = similar_patches(self.images, values, pattern, self.level, rounds=8, steps=6)
-        return replace(self, images=images, measured=torch.ones_like(self.measured), floor=None, level=self.level / 2)
-
-    def restored(self, observation: Observation, along: Tensor, options: ExactOptions) -> Tensor:
-        """Colours (3, scale H, scale W) of the scene.
-
-        ``along`` (M,) are px by which the frames are moved along the rows relative to the restored one. An unknown
-        noise level is estimated from the residual of the first fit, if there are several frames.
-        """
-        # 1. Deviations from the mean, extended to the period, and the weights of the measured and of the filled values.
-        count, width, level = len(self.images), self.images.shape[-1], self.level
-        scale = options.scale
-        mean = self.images.mean((0, 2, 3))[:, None, None]
-        data = extend_rows(self.images - mean, self.length)
-        inside = measured_values(along[None], None, data[None].shape, width, ends=True)[0]
-        nowhere = ~self.measured.any(1, keepdim=True)
-        measured, filled = (pad(mask, (0, self.length - width)) & inside for mask in (self.measured, nowhere))
-        full = self.images.detach()
-
-        def solver(strength: float) -> MosaicSolver:
-            weights = measured.to(data.dtype).masked_fill(filled, _FILLED)
-            precisions = self._precisions(full - mean, observation, level, strength)
-            return MosaicSolver(observation, weights, precisions)
-
-        # 2. Fit twice, with priors fitted to predicted instead of interpolated colours: 1 to 3 dB for eight frames. The
-        # interpolated ones lack detail, so that their prior is too strong: 0.01 instead of 1 gains 2 to 3 dB for eight
-        # frames, 1.4 dB for two, 0.1 dB for one (noise 0.002; 0.0 dB at noise 0.01).
-        first = solver(0.01 * options.regularisation)
-        coefficients = first.fit(data, iterations=12)
-        gain = None
-        with torch.no_grad():
-            predicted = first.predict(coefficients)
-            full = torch.where(self.measured, full, predicted[..., :width] + mean)
-            if count > 1:
-                residual_level, gain = _residual_level(first, data - predicted, measured)
-                if options.noise == "auto":
-                    level = residual_level
-                elif bool(residual_level > 1.5 * level):
-                    warn_of_restoration(
-                        f"the frames differ from their model by {float(residual_level / level):.1f} times the stated "
-                        "noise: the vibration is not accurate enough, the scene changes between the frames, or noise "
-                        "is too low; colours may be false"
-                    )
-            if self.floor is not None:  # saturated values are lower bounds: only those above the prediction count
-                measured[..., :width] &= (predicted[..., :width] + mean <= self.floor) | self.floor.isinf()
-        second = solver(options.regularisation)
-        scene = second.image(second.fit(data, coefficients, iterations=20)) + mean
-        scene = scene[:, :: SCALE // scale, : SCALE * width : SCALE // scale]
-        if gain is None:
-            return scene
-        # 3. Remove the noise that is left; the points of each pixel are four images, one at a time: less memory.
-        points = pixel_unshuffle(scene, scale).unflatten(0, (3, -1)).movedim(1, 0).split(1)
-        points = [similar_patches(part, part, None, gain * level, rounds=2, steps=2) for part in points]
-        return pixel_shuffle(torch.cat(points).movedim(0, 1).flatten(0, 1), scale)
-
-    def _precisions(
-        self, images: Tensor, observation: Observation, level: Tensor, regularisation: float
-    ) -> list[Tensor]:
-        """Precision of the prior of each component, fitted to frames (M, 3, H, W)."""
-        levels = level.expand(len(images))
-        return [
-            fit_polynomial_prior(image[None, :, None], self.motion, levels[None], self.length).precision(
-                level.square(), strength=regularisation, blur_reach=observation.kernels.blur_reach
-            )
-            for image in _components(images).unbind(1)
-        ]
+    # 2. Fit twice, with priors fitted to predicted instead of interpolated colours: 1 to 3 dB for eight frames. The
+    # interpolated ones lack detail, so that their prior is too strong: 0.01 instead of 1 gains 2 to 3 dB for eight
+    # frames, 1.4 dB for two, 0.1 dB for one (noise 0.002; 0.0 dB at noise 0.01).
+    first = solver(0.01 * options.regularisation)
+    coefficients = first.fit(data, iterations=12)
+    gain = None
+    with torch.no_grad():
+        predicted = first.predict(coefficients)
+        full = torch.where(known, full, predicted[..., :width] + mean)
+        if count > 1:
+            residual_level, gain = _residual_level(first, data - predicted, measured)
+            if options.noise == "auto":
+                level = residual_level
+            elif bool(residual_level > 1.5 * level):
+                warn_of_restoration(
+                    f"the frames differ from their model by {float(residual_level / level):.1f} times the stated "
+                    "noise: the vibration is not accurate enough, the scene changes between the frames, or noise "
+                    "is too low; colours may be false"
+                )
+        if floor is not None:  # saturated values are lower bounds: only those above the prediction count
+            measured[..., :width] &= (predicted[..., :width] + mean <= floor) | floor.isinf()
+    second = solver(options.regularisation)
+    scene = second.image(second.fit(data, coefficients, iterations=20)) + mean
+    scene = scene[:, :: SCALE // scale, : SCALE * width : SCALE // scale]
+    if gain is None:
+        return scene
+    # 3. Remove the noise that is left; the points of each pixel are four images, one at a time: less memory.
+    points = pixel_unshuffle(scene, scale).unflatten(0, (3, -1)).movedim(1, 0).split(1)
+    points = [similar_patches(part, part, None, gain * level, rounds=2, steps=2) for part in points]
+    return pixel_shuffle(torch.cat(points).movedim(0, 1).flatten(0, 1), scale)
 
 
 def _same_colours(displacement: Tensor, node_weights: Tensor) -> bool:

@@ -64,18 +64,9 @@ def solver_threads(device: torch.device) -> int:
     return min(allowed_threads(), MOST_THREADS) if device.type == "cpu" else 1
 
 
-def most_values(rows: int, frequencies: int, device: torch.device, *, blurred: bool, single: bool) -> int:
-    """Values of the bands in memory at a time: 128 MB on a CPU, 2 GB on a GPU, for several scenes.
-
-    A single scene takes 32 MB, or 4 times the memory of its spectrum, for each of two chunks at a time on a CPU, so
-    that results do not depend on the number of threads. Where exposures blur, the rows are not divided, and a step of
-    the elimination has fewer values: twice the memory saves 18 % of the time for 1024 and 2048 rows.
-    """
-    if device.type == "cpu":
-        values = max(1 << 22, 4 * rows * frequencies) if single else 1 << 24
-    else:
-        values = max(1 << 28, 8 * rows * frequencies)
-    return 2 * values if blurred else values
+def most_values(device: torch.device) -> int:
+    """Values of the bands in memory at a time: 128 MB on a CPU, 2 GB on a GPU."""
+    return 1 << 24 if device.type == "cpu" else 1 << 28
 
 
 class SceneSolver:
@@ -96,8 +87,7 @@ class SceneSolver:
         blurred, scenes = observation.kernels.blurred, observation.num_scenes
 
         # Chunks of the frequencies; all at a time if their factors are kept.
-        values = most_values(rows, frequencies, device, blurred=blurred, single=scenes == 1)
-        most = frequencies if keep else max(1, values // (scenes * rows * (2 * normal.width + 1)))
+        most = frequencies if keep else max(1, most_values(device) // (scenes * rows * (2 * normal.width + 1)))
         rounds = -(-frequencies // most)
         chunk = -(-frequencies // (8 * rounds)) * 8  # rows begin at full cache lines
         self._parts = runs(frequencies, min(chunk, frequencies))
