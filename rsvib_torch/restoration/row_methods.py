@@ -281,7 +281,7 @@ def restore_richardson_lucy(given: MovingFrames, options: RichardsonLucyOptions)
     psf = trajectory_psf(*motion.exposures, interpolation="cubic")
     first_tap = psf.first_tap - motion.shift.to(torch.int64)[:, :, None]
     kernels = RowPSF(first_tap[:, :, None], psf.weights.to(frames.dtype)[:, :, None], 1)
-    blur, size = RowVaryingBlur(kernels, origin=(0, 0)), tuple(frames.shape)
+    blur, size = RowVaryingBlur(kernels), tuple(frames.shape)
 
     # 2. Counts of the measured pixels, and the coefficients that affect them by more than a tenth of a pixel; others
     # keep their initial value.
