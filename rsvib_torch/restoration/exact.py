@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.execution.chunking import at_once, runs
-from rsvib_torch.execution.parallel import in_parallel
+from rsvib_torch.execution.parallel import allowed_threads, in_parallel
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.numerics.fourier import extend_rows
 from rsvib_torch.numerics.tables import table, take_stacks
@@ -42,7 +42,6 @@ from rsvib_torch.restoration.scene_solver import (
     measured_values,
     most_values,
     scene_period,
-    solver_threads,
     with_extension,
     with_missing_values,
 )
@@ -311,7 +310,7 @@ def _blocks(model: FrameModel, scenes: Scenes) -> list[tuple[str, list[int]]]:
     most = most_values(device) // systems
     scene_bytes = 4 * scenes.members.shape[1] * model.images.shape[2] * height * model.period
     most = max(1, min(most, at_once(scene_bytes, device, cpu_bytes=_FRAME_BYTES)))
-    threads = solver_threads(device)
+    threads = min(allowed_threads(), MOST_THREADS) if device.type == "cpu" else 1
     return [
         (kind, numbers[part])
         for kind, numbers in of_kind.items()

@@ -189,34 +189,27 @@ class RowKernels:
         return torch.stack([direct, alias * phase], dim=-2).flatten(-3, -2)
 
 
-def interpolation_matrix(
-    reach: float, u: Tensor | None, dtype: torch.dtype, *, symmetric: bool
-) -> tuple[Tensor, Tensor]:
+def interpolation_matrix(reach: float, u: Tensor | None, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     """Nodes (Q,) in 0 ... 1/2 cycles per px, and the matrix (2 Q, 2 U) to frequencies ``u`` (U,) on the CPU.
 
     Sums of waves of up to ``reach`` px are interpolated from real and imaginary parts at the nodes to interleaved real
-    and imaginary parts at ``u`` by Chebyshev series: with ``f(-u) = conj f(u)`` even and odd ones, else in 0 ... 1/2.
+    and imaginary parts at ``u`` by Chebyshev series.
     """
     precision = 1e-5 if dtype == torch.float32 else 1e-15
-    half = math.pi * reach * (1.0 if symmetric else 0.5)
+    half = 0.5 * math.pi * reach
     degree, bound = 1, half
     while bound > precision or degree < half:
         degree += 1
         bound *= 0.5 * half / degree if half else 0.0
-    places = np.zeros(0) if u is None else u.numpy()
-    if symmetric:  # polynomials of 2 u in -1 ... 1, of which nodes at u > 0 determine the even and the odd ones
-        count, orders, at = degree // 2 + 1, (slice(0, None, 2), slice(1, None, 2)), 2 * places
-    else:  # polynomials of 4 u - 1 in -1 ... 1
-        count, orders, at = degree + 1, (slice(None), slice(None)), 4 * places - 1
-    number = 2 * count if symmetric else count
-    nodes = np.cos(np.pi * (np.arange(count) + 0.5) / number)
-    of_nodes, of_places = chebvander(nodes, number - 1) * (2 / count), chebvander(at, number - 1)
+    # polynomials of 4 u - 1 in -1 ... 1
+    count = degree + 1
+    nodes = np.cos(np.pi * (np.arange(count) + 0.5) / count)
+    of_nodes = chebvander(nodes, degree) * (2 / count)
     of_nodes[:, 0] *= 0.5
-    matrix = np.zeros((2, count, len(places), 2))
-    for part, order in enumerate(orders):
-        matrix[part, :, :, part] = of_nodes[:, order] @ of_places[:, order].T
-    nodes = 0.5 * nodes if symmetric else 0.25 * (1 + nodes)
-    return torch.from_numpy(nodes), torch.from_numpy(matrix.reshape(2 * count, 2 * len(places)))
+    series = of_nodes @ chebvander(4 * (np.zeros(0) if u is None else u.numpy()) - 1, degree).T
+    matrix = np.zeros((2, *series.shape, 2))
+    matrix[0, ..., 0] = matrix[1, ..., 1] = series
+    return torch.from_numpy(0.25 * (1 + nodes)), torch.from_numpy(matrix.reshape(2 * count, -1))
 
 
 def _stacked(values: Tensor) -> Tensor:
@@ -250,7 +243,7 @@ class SmoothBand:
 
         The ``precision`` are products (p + 1, p + 1, N, U) of the prior there.
         """
-        bands = self._product(interpolation_matrix(self.reach, u, self.left.dtype, symmetric=True)[1])
+        bands = self._product(interpolation_matrix(self.reach, u, self.left.dtype)[1])
         order, half = len(precision) - 1, len(self.left) - self.width
         # what is added to the diagonals of the first p rows of the scene, of all rows, and of the first p middle rows
         selected = constant(prior_diagonals, order, dtype=precision.dtype, device=precision.device)
@@ -285,7 +278,7 @@ class FinerBand(SmoothBand):
     def at(self, u: Tensor, precision: Tensor) -> Tensor:
         """As in ``SmoothBand``, for a precision (p + 1, 2, U) as of ``PolynomialPrior.precision``."""
         prior = torch.stack([precision, torch.zeros_like(precision)], dim=-1).flatten(-2).flatten(0, 1)
-        interpolation = interpolation_matrix(self.reach, u, self.left.dtype, symmetric=False)[1]
+        interpolation = interpolation_matrix(self.reach, u, self.left.dtype)[1]
         right = torch.cat([interpolation.to(prior), prior])
         return torch.view_as_complex(self._product(right)).flatten(2)
 
@@ -327,7 +320,7 @@ def normal_matrices(
     The kernels are those of the frames of one scene after the other; K = ``count`` coefficients from ``top`` on, b is
     the ``width``, and the dtype of the frames determines the number of nodes.
     """
-    nodes, _ = interpolation_matrix(2 * kernels.blur_reach, None, dtype, symmetric=kernels.points == 1)
+    nodes, _ = interpolation_matrix(2 * kernels.blur_reach, None, dtype)
     nodes = nodes.to(kernels.middle.device)
     values = kernels.at(nodes)
     weighted = (values * kernels.weight[..., None, None]).conj().resolve_conj()
@@ -365,7 +358,7 @@ class Observation:
         last = max(highest + kernels.taps.shape[-2], points * (points * num_rows + SCENE_REACH))
         self.count = last - self.top
         # real and imaginary parts of every tap of every row (J, N M R, 2 Q) at Q Chebyshev nodes
-        nodes, _ = interpolation_matrix(kernels.blur_reach, None, dtype, symmetric=kernels.points == 1)
+        nodes, _ = interpolation_matrix(kernels.blur_reach, None, dtype)
         at_nodes = _stacked(kernels.at(nodes.to(kernels.middle.device))).to(dtype)
         self._at_nodes = at_nodes.flatten(0, 1).transpose(0, 1).contiguous()
         scene = torch.arange(num_scenes, device=kernels.first.device)[:, None, None]
@@ -410,8 +403,8 @@ class Observation:
 
         The kernels, or their conjugates, are without the phase of the middle.
         """
-        left, reach, symmetric = self._at_nodes, self.kernels.blur_reach, self.kernels.points == 1
-        right = interpolation_matrix(reach, self.u[part], self.dtype, symmetric=symmetric)[1]
+        left = self._at_nodes
+        right = interpolation_matrix(self.kernels.blur_reach, self.u[part], self.dtype)[1]
         if conjugate:
             right[:, 1::2].neg_()
         right = right.to(left)

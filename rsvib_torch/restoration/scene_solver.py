@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.execution.chunking import runs
-from rsvib_torch.execution.parallel import allowed_threads, in_parallel
+from rsvib_torch.execution.parallel import in_parallel
 from rsvib_torch.numerics.banded_solver import (
     BandedFactor,
     InterpolatedFactors,
@@ -57,11 +57,6 @@ def join_windows(values: Tensor, windows: list[slice]) -> Tensor:
     borders = [0, *((before.stop + after.start) // 2 for before, after in pairwise(windows)), windows[-1].stop]
     parts = zip(windows, pairwise(borders), strict=True)
     return torch.cat([values[a - w.start : b - w.start, ..., k, :] for k, (w, (a, b)) in enumerate(parts)])
-
-
-def solver_threads(device: torch.device) -> int:
-    """Chunks of frequencies that are solved side by side."""
-    return min(allowed_threads(), MOST_THREADS) if device.type == "cpu" else 1
 
 
 def most_values(device: torch.device) -> int:
