@@ -186,14 +186,25 @@ def judge_stacks(
     for stack in stacks:
         missing = None if frames.missing is None else frames.missing[stack]
         moves = [bound > 0 for bound in motion.bounds[stack]]
+        advance()
         given = _judged_strip(_Stack(raw[stack], still[stack], missing, motion.of([stack])))
         try:
             judged = [_judge_pair(_common_part(given, *pair, columns), moves, shared) for pair in pairs]
         except TooLittleInCommonError as error:
             verdicts.append(error)
-        else:
-            verdicts.append(_in_image_axes(judged, frames.image_timing, raw.device))
-        advance()
+            continue
+        # one result for all pairs, in image axes
+        levels, displacements, outcomes, reasons = zip(*judged, strict=True)
+        sizes = torch.from_numpy(np.stack(displacements, 1)).to(raw.device)  # (3, P, 2)
+        sizes = sizes.flip(-1) if frames.image_timing.scan_axis == -1 else sizes
+        of_levels = torch.tensor(levels, dtype=torch.float64, device=raw.device).unbind(-1)
+        verdict = RestorationVerdict(
+            **dict(zip(LEVELS, of_levels, strict=True)),
+            **dict(zip(DISPLACEMENTS, sizes, strict=True)),
+            outcome=outcomes,
+            findings=tuple(reasons_from_row_order(of_pair, frames.image_timing) for of_pair in reasons),
+        )
+        verdicts.append(verdict)
     return verdicts
 
 
@@ -388,22 +399,6 @@ def _judge_pair(
         outcome, reasons = "unknown", (Reason("pixels_missing", None, missing, _MAX_MISSING),)
     levels = [before**0.5, after**0.5, noise**0.5, unexplained / noise, math.nan if contradicted else gain]
     return levels, np.stack([misfit_before, misfit_after, resolution]), outcome, reasons
-
-
-def _in_image_axes(
-    judged: list[tuple[list[float], Array, Outcome, tuple[Reason, ...]]], timing: SensorTiming, device: torch.device
-) -> RestorationVerdict:
-    """The verdict on a stack from those on its pairs in row order."""
-    levels, displacements, outcomes, reasons = zip(*judged, strict=True)
-    sizes = torch.from_numpy(np.stack(displacements, 1)).to(device)  # (3, P, 2)
-    if timing.scan_axis == -1:
-        sizes = sizes.flip(-1)
-    return RestorationVerdict(
-        **dict(zip(LEVELS, torch.tensor(levels, dtype=torch.float64, device=device).unbind(-1), strict=True)),
-        **dict(zip(DISPLACEMENTS, sizes, strict=True)),
-        outcome=outcomes,
-        findings=tuple(reasons_from_row_order(of_pair, timing) for of_pair in reasons),
-    )
 
 
 def equally_bright(pair: FramePair, noise: float) -> FramePair:

@@ -175,10 +175,10 @@ class RowKernels:
         """Kernels of ``count`` rows from row ``top`` on, counted from there."""
         if count == self.first.shape[1]:
             return self
-        first, *others = (
+        first, taps, middle, along, weight = (
             value[:, top : top + count] for value in (self.first, self.taps, self.middle, self.along, self.weight)
         )
-        return RowKernels(first - top, *others)
+        return RowKernels(first - top, taps, middle, along, weight, self.points)
 
     def at(self, frequencies: Tensor) -> Tensor:
         """Kernels (M, R, J, Q) without the phase of the middle at the frequency."""

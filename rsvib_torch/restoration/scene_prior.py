@@ -325,9 +325,9 @@ def sample_rows(images: Tensor, kernels: RowKernels, chosen: NDArray[np.int64]) 
 
     # coefficients of a slab count from its first row
     first = kernels.first - height * (torch.arange(slabs * height, device=images.device) // height)
-    of_slabs = RowKernels(
-        *map(in_slabs, (first, kernels.taps, torch.zeros_like(kernels.middle), kernels.along, kernels.weight))
-    )
+    values = (first, kernels.taps, torch.zeros_like(kernels.middle), kernels.along, kernels.weight)
+    first, taps, middle, along, weight = map(in_slabs, values)
+    of_slabs = RowKernels(first, taps, middle, along, weight)
     observation = Observation(of_slabs, height, width, images.dtype, scenes * slabs).at_frequencies(u, width)
     spectra = spectra.unflatten(3, (slabs, height)).movedim(3, 1).flatten(0, 1)
     return SampledRows(observation, spectra, channels * float((taper**2).sum()))
