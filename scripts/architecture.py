@@ -22,7 +22,7 @@ LAYERS: tuple[dict[str, str], ...] = (
     {"gyroscope": "recorded motions: files, alignment of clock and axes with frames"},
     {
         "detection": "detect.py: frames → motion, standard deviations, verdict",
-        "restoration": "restore.py: frames and motion → frames, verdict; one file per method",
+        "restoration": "restore.py: frames and motion → frames; exact.py, row_methods.py: methods; judge.py: verdict",
     },
     {"registration": "offsets of bands (register.py, methods.py) and of rows (gradients.py) between frames"},
     {"imaging": "image formation: trajectory, point spread function, blur, optics, noise, simulator"},
@@ -59,11 +59,12 @@ INNER_LAYERS: dict[str, tuple[set[str], ...]] = {
     "evaluation": ({"quality", "mtf", "bound"},),
     "report": ({"results", "plots"}, {"page"}),
     "restoration": (
-        {"frame_motion", "restoration_warning"},
-        {"scene_model"},
-        {"noise"},
-        {"exact", "banded", "dewarp", "verdict"},
-        {"richardson_lucy"},
+        {"frame_motion", "observation", "restoration_verdict"},
+        {"scene_prior"},
+        {"noise", "scene_solver"},
+        {"finer_grid", "judge", "priors", "row_methods"},
+        {"mosaic_scene"},
+        {"exact"},
         {"restore"},
     ),
 }

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from rsvib_torch.options import ExactOptions
-from rsvib_torch.restoration.exact.exact import model_frames, solve_scenes
+from rsvib_torch.restoration.exact import model_frames, solve_scenes
 from rsvib_torch.restoration.frame_motion import MovingFrames, frame_motion, joint_groups
 
 

@@ -138,7 +138,7 @@ def test_modules_that_use_a_displacement_per_row_state_the_invariant():
         ("if TYPE_CHECKING:\n    import rsvib_torch.registration", "rsvib_torch.imaging.simulate"),
         ("module = importlib.import_module(NAME)", "rsvib_torch.results.presentation"),
         ("from rsvib_torch.detection.rows import displacements", "rsvib_torch.detection.tones.fit"),
-        ("from rsvib_torch.restoration.exact.exact import restore_exact", "rsvib_torch.restoration.dewarp"),
+        ("from rsvib_torch.restoration.exact import restore_exact", "rsvib_torch.restoration.row_methods"),
     ],
 )
 def test_an_import_in_the_wrong_direction_is_found(source, module):

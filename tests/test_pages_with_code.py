@@ -9,7 +9,7 @@ import torch
 import rsvib_torch as rsv
 from rsvib_torch.datasets import resolution_chart
 from rsvib_torch.registration.methods import BAND_METHODS
-from rsvib_torch.restoration.exact.priors import PRIORS
+from rsvib_torch.restoration.priors import PRIORS
 from rsvib_torch.results.reason import REASONS
 
 DOCS = Path(__file__).parents[1] / "docs"

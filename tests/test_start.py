@@ -13,7 +13,7 @@ from rsvib_torch.detection import pipeline
 from rsvib_torch.motion import recorded
 from rsvib_torch.options import METHOD_OPTIONS, DetectionMethod, MotionUnit, PriorName, Registration
 from rsvib_torch.registration.methods import BAND_METHODS
-from rsvib_torch.restoration.exact.priors import PRIORS
+from rsvib_torch.restoration.priors import PRIORS
 from rsvib_torch.restoration.restore import METHODS
 
 PACKAGE = Path(rsv.__file__).parent

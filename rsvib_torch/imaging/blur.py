@@ -13,12 +13,12 @@ import torch
 from torch import Tensor, nn
 
 from rsvib_torch.checks.arguments import check_broadcast, check_images, checked_methods, checks_arguments
-from rsvib_torch.checks.values import check_choice, check_whole_number
+from rsvib_torch.checks.values import check_choice
 from rsvib_torch.execution.precision import full_precision, outside_graphs
 from rsvib_torch.files.free_memory import check_fits
 from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
 from rsvib_torch.motion.motion import Motion
-from rsvib_torch.motion.timing import MAX_ROWS, SensorTiming
+from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.splines import (
     bspline_coefficients,
     bspline_coefficients_adjoint,
@@ -160,94 +160,74 @@ def form_rows(
     node_weights: Tensor,
     frequencies: Tensor,
     degree: int,
-    *,
-    num_scenes: int = 1,
 ) -> Tensor:
     """Form rows of frames from the spectra of the rows of a scene, which is mirrored beyond its first and last row.
 
-    The ``spectra`` (..., S, U) are those of B-spline coefficients, of ``degree`` across the rows; the rows of several
-    scenes follow each other. ``places`` (..., R, N) are scene rows at the nodes of the exposures of R rows, and
-    ``along`` (..., R, N) displacements along the rows in px, (B, R, N) for several scenes; ``node_weights`` (N,) sum to
-    1; frequencies (U,) are in cycles per px.
+    The ``spectra`` (..., S, U) are those of B-spline coefficients, of ``degree`` across the rows. ``places`` (..., R,
+    N) are scene rows at the nodes of the exposures of R rows, and ``along`` (..., R, N) displacements along the rows in
+    px; ``node_weights`` (N,) sum to 1; frequencies (U,) are in cycles per px.
     """
     first, taps = row_taps(places, node_weights, partial(bspline_weights, degree=degree))
     source = first[..., None] + torch.arange(-(degree // 2), taps.shape[-2] - degree // 2, device=first.device)
-    num_rows = spectra.shape[-2] // num_scenes
-    source = mirrored(source, num_rows)
-    if num_scenes > 1:
-        source = source + num_rows * torch.arange(num_scenes, device=source.device)[:, None, None]
+    source = mirrored(source, spectra.shape[-2])
     transfer = row_transfer(taps, along, frequencies).to(spectra.dtype)
     # sum over the taps of each row
     return (spectra[..., source, :] * transfer).sum(-2)
 
 
-def _gather_index(psf: RowPSF, tap: int, scene_size: tuple[int, int], width: int, origin: tuple[int, int]) -> Tensor:
-    """Flat scene index (..., R, width + KW - 1) of the pixels that kernel row ``tap`` of each row uses."""
-    device = psf.weights.device
+def _gather_index(psf: RowPSF, tap: int, scene_size: tuple[int, int]) -> Tensor:
+    """Flat scene index (..., R, W + KW - 1) of the pixels that kernel row ``tap`` of each row uses."""
+    device, (height, width) = psf.weights.device, scene_size
     num_rows, kernel_width = psf.weights.shape[-3], psf.weights.shape[-1]
-    rows = origin[0] + torch.arange(num_rows, device=device) - psf.first_tap[..., 1] - tap
-    columns = origin[1] + torch.arange(-(kernel_width - 1), width, device=device) - psf.first_tap[..., 0, None]
-    return mirrored(rows, scene_size[0])[..., None] * scene_size[1] + mirrored(columns, scene_size[1])
-
-
-def _frame_size(
-    psf: RowPSF, scene: tuple[int, int], frame_width: int | None, origin: tuple[int, int] | None
-) -> tuple[int, tuple[int, int]]:
-    width = scene[1] if frame_width is None else frame_width
-    if origin is None:
-        origin = ((scene[0] - psf.weights.shape[-3]) // 2, (scene[1] - width) // 2)
-    return width, origin
+    rows = (height - num_rows) // 2 + torch.arange(num_rows, device=device) - psf.first_tap[..., 1] - tap
+    columns = torch.arange(-(kernel_width - 1), width, device=device) - psf.first_tap[..., 0, None]
+    return mirrored(rows, height)[..., None] * width + mirrored(columns, width)
 
 
 @outside_graphs
 @full_precision
-def blur_rows(
-    scene: Tensor, psf: RowPSF, *, frame_width: int | None = None, origin: tuple[int, int] | None = None
-) -> Tensor:
+def blur_rows(scene: Tensor, psf: RowPSF) -> Tensor:
     """Form frames (..., R, W): every output row is the scene convolved with that row's kernel (Eq. 38).
 
     The output row selects the kernel: convolve, then take the row. Beyond its edges the scene is mirrored.
 
     Args:
-        scene: (..., Hs, Ws); leading dimensions broadcast against those of the kernels.
+        scene: (..., Hs, W), of which the frame shows the R rows in the middle; leading dimensions broadcast against
+            those of the kernels.
         psf: Kernels of R rows.
-        frame_width: Width W of the frame, by default that of the scene.
-        origin: Scene pixel (row, column) at frame pixel (0, 0) without motion; by default the frame is centred.
     """
     size = (scene.shape[-2], scene.shape[-1])
-    width, origin = _frame_size(psf, size, frame_width, origin)
     coefficients = bspline_coefficients(bspline_coefficients(scene, psf.degree, -1), psf.degree, -2)
     weights = psf.weights.to(scene.dtype)
     check_broadcast(scene=scene[..., 0, 0], psf=weights[..., 0, 0, 0])
     lead = torch.broadcast_shapes(scene.shape[:-2], weights.shape[:-3])
     flat = coefficients.flatten(-2).expand(*lead, -1)
     num_rows, kernel_height, kernel_width = weights.shape[-3:]
-    frames = scene.new_zeros(*lead, num_rows, width)
+    frames = scene.new_zeros(*lead, num_rows, size[1])
     for tap in range(kernel_height):
-        index = _gather_index(psf, tap, size, width, origin)
+        index = _gather_index(psf, tap, size)
         pixels = flat.gather(-1, index.flatten(-2).expand(*lead, -1)).unflatten(-1, index.shape[-2:])
         for column in range(kernel_width):
-            part = pixels.narrow(-1, kernel_width - 1 - column, width)
+            part = pixels.narrow(-1, kernel_width - 1 - column, size[1])
             frames = frames + weights[..., tap, column, None] * part
     return frames
 
 
 @outside_graphs
 @full_precision
-def blur_rows_adjoint(
-    frames: Tensor, psf: RowPSF, scene_shape: tuple[int, ...], *, origin: tuple[int, int] | None = None
-) -> Tensor:
+def blur_rows_adjoint(frames: Tensor, psf: RowPSF, scene_shape: tuple[int, ...]) -> Tensor:
     """Apply the exact adjoint (transpose) of ``blur_rows`` to frames (..., R, W).
 
-    Leading dimensions of ``scene_shape`` (..., Hs, Ws) that were broadcast are summed.
+    Leading dimensions of ``scene_shape`` (..., Hs, W) that were broadcast are summed.
     """
     if len(scene_shape) < 2 or min(scene_shape) < 1:
         raise ValueError(f"scene_shape must be (..., height, width), all at least 1, got {tuple(scene_shape)}")
     size = (scene_shape[-2], scene_shape[-1])
-    width, origin = _frame_size(psf, size, frames.shape[-1], origin)
     weights = psf.weights.to(frames.dtype)
     if frames.shape[-2] != weights.shape[-3]:
         raise ValueError(f"frames must have the {weights.shape[-3]} rows of the kernels, got {frames.shape[-2]}")
+    if frames.shape[-1] != size[1]:
+        raise ValueError(f"scene_shape must have the {frames.shape[-1]} columns of the frames, got {size[1]}")
     check_broadcast(frames=frames[..., 0, 0], psf=weights[..., 0, 0, 0])
     lead = torch.broadcast_shapes(frames.shape[:-2], weights.shape[:-3])
     summed = zip(reversed(scene_shape[:-2]), reversed(lead), strict=False)
@@ -259,10 +239,10 @@ def blur_rows_adjoint(
     flat = frames.new_zeros(*lead, math.prod(size))
     num_rows, kernel_height, kernel_width = weights.shape[-3:]
     for tap in range(kernel_height):
-        pixels = frames.new_zeros(*lead, num_rows, width + kernel_width - 1)
+        pixels = frames.new_zeros(*lead, num_rows, size[1] + kernel_width - 1)
         for column in range(kernel_width):
-            pixels.narrow(-1, kernel_width - 1 - column, width).add_(weights[..., tap, column, None] * frames)
-        index = _gather_index(psf, tap, size, width, origin)
+            pixels.narrow(-1, kernel_width - 1 - column, size[1]).add_(weights[..., tap, column, None] * frames)
+        index = _gather_index(psf, tap, size)
         flat = flat.scatter_add(-1, index.flatten(-2).expand(*lead, -1), pixels.flatten(-2))
     scene = flat.unflatten(-1, size).sum_to_size(scene_shape)
     return bspline_coefficients_adjoint(bspline_coefficients_adjoint(scene, psf.degree, -2), psf.degree, -1)
@@ -277,9 +257,6 @@ class RowVaryingBlur(nn.Module):
 
     Args:
         psf: Kernels of all rows (kept as buffers).
-        frame_width: Width of the frame, by default that of the scene.
-        origin: As in ``blur_rows``.
-        scene_size: Height and width of the scene for ``A_adjoint``, by default those of the frames.
 
     Example:
         >>> from rsvib_torch import SensorTiming, Vibration, row_psf
@@ -293,23 +270,11 @@ class RowVaryingBlur(nn.Module):
     first_tap: Tensor
     weights: Tensor
 
-    def __init__(
-        self,
-        psf: RowPSF,
-        frame_width: int | None = None,
-        origin: tuple[int, int] | None = None,
-        scene_size: tuple[int, int] | None = None,
-    ) -> None:
+    def __init__(self, psf: RowPSF) -> None:
         super().__init__()
-        for name, size in (("frame_width", frame_width), *(("scene_size", size) for size in scene_size or ())):
-            if size is not None:
-                check_whole_number(name, size, at_least=1, at_most=MAX_ROWS)
         self.register_buffer("first_tap", psf.first_tap)
         self.register_buffer("weights", psf.weights)
         self.degree = psf.degree
-        self.frame_width = frame_width
-        self.origin = origin
-        self.scene_size = scene_size
 
     @property
     def psf(self) -> RowPSF:
@@ -317,21 +282,20 @@ class RowVaryingBlur(nn.Module):
         return RowPSF(self.first_tap, self.weights, self.degree)
 
     def forward(self, scene: Tensor) -> Tensor:
-        """Form frames (..., R, W) from a scene (..., Hs, Ws)."""
+        """Form frames (..., R, W) from a scene (..., Hs, W)."""
         check_images({"scene": scene}, {"scene": "... H W"})
-        return blur_rows(scene, self.psf, frame_width=self.frame_width, origin=self.origin)
+        return blur_rows(scene, self.psf)
 
     def adjoint(self, frames: Tensor, scene_shape: tuple[int, ...]) -> Tensor:
         """Apply the exact adjoint to frames (..., R, W)."""
         check_images({"frames": frames}, {"frames": "... R W"})
-        return blur_rows_adjoint(frames, self.psf, scene_shape, origin=self.origin)
+        return blur_rows_adjoint(frames, self.psf, scene_shape)
 
     def A(self, x: Tensor, **kwargs: object) -> Tensor:  # noqa: N802 - name that solvers use
         """``forward`` under the name that solvers use; their further keywords are ignored."""
         return self(x)
 
     def A_adjoint(self, y: Tensor, **kwargs: object) -> Tensor:  # noqa: N802 - name that solvers use
-        """``adjoint`` for scenes with the leading dimensions of the frames and ``scene_size``."""
+        """``adjoint`` for scenes with the shape of the frames."""
         check_images({"y": y}, {"y": "... R W"})
-        size = (y.shape[-2], y.shape[-1]) if self.scene_size is None else self.scene_size
-        return self.adjoint(y, (*y.shape[:-2], *size))
+        return self.adjoint(y, tuple(y.shape))

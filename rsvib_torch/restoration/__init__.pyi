@@ -1,12 +1,9 @@
-from .dewarp import FixedDewarp
-from .frame_motion import visible_pixels
+from .frame_motion import RestorationWarning, displacement_uncertainty, trusted_vibration, visible_pixels
+from .judge import TooLittleInCommonError, judge_restoration
 from .noise import estimate_noise
-from .restoration_warning import RestorationWarning
+from .restoration_verdict import RestorationVerdict
 from .restore import VibrationRestorer, check_optics, restore
-from .verdict.judge import judge_restoration
-from .verdict.pairs import TooLittleInCommonError
-from .verdict.restoration_verdict import RestorationVerdict
-from .verdict.trust import displacement_uncertainty, trusted_vibration
+from .row_methods import FixedDewarp
 
 __all__ = [
     "FixedDewarp",

@@ -21,9 +21,8 @@ from rsvib_torch.frames.pixels import cut_parts
 from rsvib_torch.numerics.fourier import squared_modulus
 from rsvib_torch.numerics.tables import Array, constant, median, quantile, table, tables, valid_mean, without_nan
 from rsvib_torch.restoration.frame_motion import FrameMotion
-from rsvib_torch.restoration.scene_model.cross_validation import sample_rows
-from rsvib_torch.restoration.scene_model.observation import RowKernels
-from rsvib_torch.restoration.scene_model.scene_prior import cut_pieces, spread_starts, taper
+from rsvib_torch.restoration.observation import RowKernels
+from rsvib_torch.restoration.scene_prior import cut_pieces, sample_rows, spread_starts, taper
 
 # Squares for power spectra, and which parts of images count
 
@@ -151,13 +150,8 @@ def noise_of_frame_pair(frames: Tensor, motion: FrameMotion, ignore: Tensor | No
                 pairs[stack] = members, step
     if not pairs:
         return result
-    # rows and columns of the scene that both frames contain, of all stacks or else of one stack after the other
+    # rows and columns of the scene that both frames of all stacks contain: at least as many as needed
     common = size - np.abs([step for _, step in pairs.values()]).max(0)
-    if min(common) < least:
-        for stack in pairs:
-            missing = None if ignore is None else ignore[[stack]]
-            result[[stack]] = noise_of_frame_pair(frames[[stack]], motion.of([stack]), missing, high_pass[[stack]])
-        return result
     num_rows, columns = min(common[0], 256), common[1]  # from the middle: more rows hardly lower the variance
     stacks = list(pairs)
     members = np.stack([members for members, _ in pairs.values()])  # (S, 2)
@@ -201,7 +195,7 @@ def _residual_power(images: Tensor, displacement: Tensor, node_weights: Tensor) 
     """
     num_rows, width = images.shape[-2:]
     moved = displacement.flatten(0, 1)
-    kernels = RowKernels.of_rows(moved, node_weights, moved.new_ones(len(moved)), num_rows, 4 * _MIN_SIDE)
+    kernels = RowKernels.of_rows(moved, node_weights, moved.new_ones(len(moved)), num_rows, margin=4 * _MIN_SIDE)
     count = min(24, width // 4)
     chosen = np.linspace(width // 4, width // 2, count, dtype=np.float32).astype(np.int64)
     sample = sample_rows(images, kernels, chosen)

@@ -17,21 +17,19 @@ from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import OpticsOptions, RestorationOptions, RestoreOptions, RestorerOptions
-from rsvib_torch.restoration.banded import restore_banded
-from rsvib_torch.restoration.dewarp import restore_dewarp
-from rsvib_torch.restoration.exact.exact import restore_exact
+from rsvib_torch.restoration.exact import restore_exact
 from rsvib_torch.restoration.frame_motion import (
     FrameMotion,
     Method,
     MovingFrames,
     motion_of_frames,
     restore_in_strips,
+    vibration_to_undo,
+    warn_of_restoration,
 )
-from rsvib_torch.restoration.restoration_warning import warn_of_restoration
-from rsvib_torch.restoration.richardson_lucy import restore_richardson_lucy
-from rsvib_torch.restoration.verdict.judge import judge_stacks
-from rsvib_torch.restoration.verdict.restoration_verdict import RestorationVerdict
-from rsvib_torch.restoration.verdict.trust import vibration_to_undo
+from rsvib_torch.restoration.judge import judge_stacks
+from rsvib_torch.restoration.restoration_verdict import RestorationVerdict
+from rsvib_torch.restoration.row_methods import restore_banded, restore_dewarp, restore_richardson_lucy
 
 # Restoration methods. A method is called as
 #
@@ -194,9 +192,9 @@ def _warn_if_worse(frames: PreparedFrames, restored: Tensor, motion: FrameMotion
     """Judge the stacks that move on 160 columns of two pairs of frames."""
     if frames.images.shape[1] < 2:
         return
-    moves = {stack: [bound > 0 for bound in bounds] for stack, bounds in enumerate(motion.bounds) if any(bounds)}
-    verdicts = judge_stacks(frames, restored, motion, moves, joint=joint, most_pairs=2, columns=160)
-    for stack, verdict in zip(moves, verdicts, strict=True):
+    moving = [stack for stack, bounds in enumerate(motion.bounds) if any(bounds)]
+    verdicts = judge_stacks(frames, restored, motion, moving, joint=joint, most_pairs=2, columns=160)
+    for stack, verdict in zip(moving, verdicts, strict=True):
         # frames that share no scene cannot be compared
         if isinstance(verdict, RestorationVerdict) and verdict.overall in ("partly", "worse"):
             where = f"stack {stack}: " if len(restored) > 1 else ""

@@ -11,7 +11,7 @@ import psutil
 from rsvib_torch.files.free_memory import check_fits, free_memory, size_text
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.options import OptionTable
-from rsvib_torch.restoration.exact.priors import PRIORS
+from rsvib_torch.restoration.priors import PRIORS
 from rsvib_torch.text import quoted
 
 # bytes; of the process with its libraries, and of a window independent of its size; peaks measured by

@@ -24,14 +24,14 @@ from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import RestorationOptions
 from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError
+from rsvib_torch.restoration.frame_motion import vibration_to_undo
+from rsvib_torch.restoration.judge import judge_prepared
 from rsvib_torch.restoration.restore import (
     check_optics,
     restore_prepared,
     unchanged_frames,
     warn_of_mosaic,
 )
-from rsvib_torch.restoration.verdict.judge import judge_prepared
-from rsvib_torch.restoration.verdict.trust import vibration_to_undo
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
 

@@ -103,7 +103,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     rsv.process_stack(stack, folder / "out.npy", timing, **windows)
     manifest = rsv.read_manifest(folder / "out.npy.manifest.json")
     psf = rsv.row_psf(vibration, timing.row_starts(1, 96)[0], timing)
-    blur = rsv.RowVaryingBlur(psf, frame_width=64)
+    blur = rsv.RowVaryingBlur(psf)
     random_tones = {"amplitude": (0.5, 2.0), "frequency": (40.0, 200.0)}
     augmentation = rsv.RollingShutterVibration(timing, **random_tones)
     detector = rsv.VibrationDetector(timing, **DETECTION)

@@ -32,7 +32,7 @@ from scipy.ndimage import shift, spline_filter
 from scipy.optimize import linear_sum_assignment
 
 import rsvib_torch as rsv
-from rsvib_torch.restoration.verdict.trust import displacement_uncertainty
+from rsvib_torch.restoration.frame_motion import displacement_uncertainty
 
 OPTIONS = {
     "honesty_classes": (tuple(CLASSES), "honesty: classes of recordings", CLASSES),

@@ -86,7 +86,7 @@ def test_output_row_selects_its_kernel(interpolation):
     """Inside its boundaries the frame is the double sum over taps in each row."""
     psf = small_psf(interpolation)
     scene = noise(46, 50)
-    frame = blur_rows(scene, psf, frame_width=18, origin=(16, 16))
+    frame = blur_rows(scene, psf)
     samples = scene
     if interpolation == "cubic":
         from scipy import ndimage
@@ -94,9 +94,9 @@ def test_output_row_selects_its_kernel(interpolation):
         samples = torch.from_numpy(ndimage.spline_filter(scene.numpy(), order=3, mode="mirror"))
     for r in range(14):
         x, y = psf.first_tap[r].tolist()
-        for c in (0, 7, 17):
+        for c in (16, 23, 33):
             total = sum(
-                psf.weights[r, j, k] * samples[16 + r - y - j, 16 + c - x - k]
+                psf.weights[r, j, k] * samples[16 + r - y - j, c - x - k]
                 for j in range(psf.weights.shape[-2])
                 for k in range(psf.weights.shape[-1])
             )
@@ -104,21 +104,21 @@ def test_output_row_selects_its_kernel(interpolation):
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
-@pytest.mark.parametrize(("scene_lead", "origin"), [((), (0, 0)), ((3,), (1, -2)), ((2, 1), (0, 0)), ((2, 3), (-3, 4))])
-def test_adjoint_of_batches(interpolation, scene_lead, origin):
+@pytest.mark.parametrize("scene_lead", [(), (3,), (2, 1), (2, 3)])
+def test_adjoint_of_batches(interpolation, scene_lead):
     """<A x, y> = <x, A^T y>."""
     psf = small_psf(interpolation, batch=3)
     scene = noise(*scene_lead, 24, 28, seed=1)
-    frame = blur_rows(scene, psf, frame_width=18, origin=origin)
+    frame = blur_rows(scene, psf)
     lead = torch.broadcast_shapes(scene_lead, (3,))
-    assert frame.shape == (*lead, 14, 18)
+    assert frame.shape == (*lead, 14, 28)
     other = noise(*frame.shape, seed=2)
-    back = blur_rows_adjoint(other, psf, tuple(scene.shape), origin=origin)
+    back = blur_rows_adjoint(other, psf, tuple(scene.shape))
     assert back.shape == scene.shape
     assert (frame * other).sum().item() == pytest.approx((scene * back).sum().item(), rel=1e-11)
     for index in range(3):
         one = RowPSF(psf.first_tap[index], psf.weights[index], psf.degree)
-        expected = blur_rows(scene.expand(*lead, 24, 28)[..., index, :, :], one, frame_width=18, origin=origin)
+        expected = blur_rows(scene.expand(*lead, 24, 28)[..., index, :, :], one)
         torch.testing.assert_close(frame[..., index, :, :], expected, rtol=0, atol=1e-12)
 
 
@@ -126,8 +126,8 @@ def test_adjoint_of_batches(interpolation, scene_lead, origin):
 def test_gradients(interpolation):
     psf = small_psf(interpolation, rows=5)
     scene = noise(9, 8).requires_grad_()
-    frame = noise(5, 7).requires_grad_()
-    assert torch.autograd.gradcheck(lambda s: blur_rows(s, psf, frame_width=7), scene)
+    frame = noise(5, 8).requires_grad_()
+    assert torch.autograd.gradcheck(lambda s: blur_rows(s, psf), scene)
     assert torch.autograd.gradcheck(lambda g: blur_rows_adjoint(g, psf, (9, 8)), frame)
 
 
@@ -141,7 +141,7 @@ def test_gradients_to_the_vibration(interpolation):
     def frame(amplitude, frequency, phase, image_motion):
         vibration = Vibration(amplitude, frequency, phase, image_motion)
         psf = row_psf(vibration, timing.row_starts(1, 7)[0], timing, interpolation=interpolation)
-        return RowVaryingBlur(psf, frame_width=6)(scene)
+        return RowVaryingBlur(psf)(scene)
 
     assert torch.autograd.gradcheck(frame, parameters)
     gradients = torch.autograd.grad(frame(*parameters).sin().sum(), parameters)

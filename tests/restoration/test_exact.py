@@ -14,12 +14,12 @@ from rsvib_torch import SensorTiming, Vibration, psnr, simulate_frames
 from rsvib_torch.datasets import city_and_fields
 from rsvib_torch.restoration import restore as restore_by_any_method
 from rsvib_torch.restoration import visible_pixels
-from rsvib_torch.restoration.exact.exact import model_frames
-from rsvib_torch.restoration.exact.priors import PRIORS, Prior, shrink_patches
-from rsvib_torch.restoration.exact.scene_solver import SceneSolver
+from rsvib_torch.restoration.exact import model_frames
 from rsvib_torch.restoration.frame_motion import MovingFrames, frame_motion
-from rsvib_torch.restoration.scene_model.observation import Observation, RowKernels
-from rsvib_torch.restoration.scene_model.scene_prior import RowPrior, fit_prior
+from rsvib_torch.restoration.observation import Observation, RowKernels
+from rsvib_torch.restoration.priors import PRIORS, Prior, shrink_patches
+from rsvib_torch.restoration.scene_prior import RowPrior, fit_prior
+from rsvib_torch.restoration.scene_solver import SceneSolver
 
 restore = partial(restore_by_any_method, method="exact")
 quietly = partial(restore, check=False)

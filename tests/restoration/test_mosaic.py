@@ -12,9 +12,10 @@ from truth import decibel, draw_scene
 import rsvib_torch as rsv
 from rsvib_torch.frames.mosaic import colour_frames, is_mosaic
 from rsvib_torch.restoration import RestorationWarning
-from rsvib_torch.restoration.exact.mosaic_scene import MosaicSolver
+from rsvib_torch.restoration.finer_grid import PolynomialPrior
 from rsvib_torch.restoration.frame_motion import frame_motion
-from rsvib_torch.restoration.scene_model.finer_grid import FinerObservation, PolynomialPrior
+from rsvib_torch.restoration.mosaic_scene import MosaicSolver
+from rsvib_torch.restoration.observation import Observation, RowKernels
 
 SIZE, MARGIN, NOISE = 72, 24, 0.003
 
@@ -145,8 +146,8 @@ def test_gradient_of_the_least_squares_solution():
     generator = torch.Generator().manual_seed(1)
     motion = frame_motion(VIBRATION.expanded(1), TIMING.in_row_order(), 2, 24)
     displacement, node_weights = motion.exposures
-    kernels = FinerObservation.kernels_of_rows(displacement[0], node_weights, torch.ones(2), 24)
-    observation = FinerObservation(kernels, 24, 32, torch.float64)
+    kernels = RowKernels.of_rows(displacement[0], node_weights, torch.ones(2), 24, points=2)
+    observation = Observation(kernels, 24, 32, torch.float64)
     prior = PolynomialPrior(torch.ones(7, 7, dtype=torch.float64), 32)
     precisions = [
         prior.precision(torch.tensor(1e-4 * factor), blur_reach=kernels.blur_reach) for factor in (1.0, 4.0, 4.0)

@@ -14,8 +14,8 @@ from truth import Motion, crop, decibel, draw_scene, take_frames
 from rsvib_torch import SensorTiming, Vibration
 from rsvib_torch.datasets import city_and_fields, resolution_chart
 from rsvib_torch.restoration import RestorationWarning, judge_restoration, restore
-from rsvib_torch.restoration.verdict.judge import outcome_of_pair
-from rsvib_torch.restoration.verdict.pairs import pairs_to_judge
+from rsvib_torch.restoration.judge import pairs_to_judge
+from rsvib_torch.restoration.restoration_verdict import outcome_of_pair
 from rsvib_torch.results.reason import Reason
 
 HEIGHT, WIDTH, MARGIN = 512, 192, 40

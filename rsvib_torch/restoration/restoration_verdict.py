@@ -18,6 +18,13 @@ OUTCOMES: tuple[Outcome, ...] = ("helps", "unknown", "partly", "worse")  # in or
 LEVELS = ("before", "after", "noise", "chi_square", "predicted_gain")
 DISPLACEMENTS = ("misfit_before", "misfit_after", "resolution")
 
+# Thresholds of the two scores of the verdict, fitted on 720 restorations with known truth, see docs/ablation.md.
+_PARTLY_RESIDUAL = 0.35  # of the displacement between the raw frames; above, a part of the vibration was not undone
+_WORSE_RESIDUAL = 0.8  # of that displacement; above, the vibration was not undone
+_GAIN_ERROR = 2.0  # dB; error of the estimated gain, up to which its sign is not used
+_FINEST = 0.03  # px; misfit that is negligible in any image
+_CROSSTALK = 0.05  # error of a misfit along one axis, relative to the displacement along the other
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RestorationVerdict(
@@ -101,3 +108,57 @@ class RestorationVerdict(
             "worse": f"restored is no better than raw{counted}: {self.reasons[worst]}",
         }
         return sentences[self.overall]
+
+
+def outcome_of_pair(
+    before: list[float],
+    after: list[float],
+    resolution: list[float],
+    moves: list[bool],
+    offset: list[float],
+    gain: float,
+    *,
+    one_image: bool = False,
+) -> tuple[Outcome, tuple[Reason, ...]]:
+    """Outcome of one pair, and the reasons for it; none if restoration helps.
+
+    Scores are the residual displacement relative to that of the raw frames, and the estimated gain in dB. The gain
+    decides where the residual is small, because it is valid only where the motion is right. ``before`` and ``after``
+    are the misfits (x, y) in px of the raw and of the restored frames, ``offset`` is what the vibration predicts for
+    the raw ones, and below the ``resolution`` a misfit cannot be distinguished from 0. ``moves`` are the axes with
+    motion. ``one_image`` states that both frames were restored to one image, whose gain is not valid for a wrong
+    motion.
+    """
+    outcomes: list[tuple[Outcome, Reason | None]] = []
+    motion_is_complete = True
+    for axis, name in enumerate("xy"):
+        least, size, rest = max(resolution[axis], _FINEST), before[axis], after[axis]
+        if not moves[axis]:
+            motion_is_complete &= size <= least
+            continue
+        negligible = max(least, _CROSSTALK * before[1 - axis])
+        visible = max(size, offset[axis])
+        details = {"before": size}
+        if math.isinf(least):
+            outcomes.append(("unknown", Reason("no_contrast", name)))
+        elif rest <= negligible and visible <= least:
+            outcomes.append(("unknown", Reason("displaced_alike", name, visible, least)))
+        elif rest <= max(negligible, _PARTLY_RESIDUAL * size):
+            outcomes.append(("helps", None))
+        elif rest > _WORSE_RESIDUAL * size:
+            # less noise may outweigh a motion that was not undone, but not a motion that does not exist
+            outweighed = size > least and gain > _GAIN_ERROR and not one_image
+            remains = Reason("motion_remains", name, rest, max(_WORSE_RESIDUAL * size, negligible), details)
+            outcomes.append(("partly" if outweighed else "worse", remains))
+        else:
+            remains = Reason("motion_remains", name, rest, max(_PARTLY_RESIDUAL * size, negligible), details)
+            outcomes.append(("partly", remains))
+    if not outcomes:
+        return "unknown", (Reason("nothing_undone"),)
+    outcome = max((outcome for outcome, _ in outcomes), key=OUTCOMES.index)
+    reasons = tuple(reason for kind, reason in outcomes if kind == outcome and reason is not None)
+    if outcome in ("partly", "worse") or gain >= 0 or not motion_is_complete:
+        return outcome, reasons
+    if gain < -_GAIN_ERROR:
+        return "worse", (Reason("noise_outweighs", None, gain, -_GAIN_ERROR),)
+    return "unknown", reasons or (Reason("improvement_uncertain", None, gain, -_GAIN_ERROR),)

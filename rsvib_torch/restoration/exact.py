@@ -8,7 +8,6 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -17,34 +16,35 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.execution.chunking import at_once, runs
-from rsvib_torch.execution.parallel import in_parallel
+from rsvib_torch.execution.parallel import allowed_threads, in_parallel
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.numerics.fourier import extend_rows
-from rsvib_torch.numerics.tables import table, tables, take_stacks
+from rsvib_torch.numerics.tables import table, take_stacks
 from rsvib_torch.options import ExactOptions
-from rsvib_torch.restoration.exact.filling import (
+from rsvib_torch.restoration.finer_grid import (
+    FrameDifference,
+    PolynomialPrior,
+    finer_scene,
+    fit_polynomial_prior,
+    warn_of_frames,
+)
+from rsvib_torch.restoration.frame_motion import MovingFrames, joint_groups
+from rsvib_torch.restoration.mosaic_scene import restore_mosaic
+from rsvib_torch.restoration.noise import noise_levels
+from rsvib_torch.restoration.observation import SCENE_REACH, TAPS, Observation, RowKernels
+from rsvib_torch.restoration.priors import PRIORS, check_prior
+from rsvib_torch.restoration.scene_prior import RowPrior, brightness, fit_prior, prior_strengths
+from rsvib_torch.restoration.scene_solver import (
     FILLED_BLUR_REACH,
+    MIN_LEVEL,
+    MOST_THREADS,
+    SceneProblem,
     measured_values,
+    most_values,
     scene_period,
     with_extension,
     with_missing_values,
 )
-from rsvib_torch.restoration.exact.finer_scene import FrameDifference, finer_scene, warn_of_frames
-from rsvib_torch.restoration.exact.mosaic_scene import restore_mosaic
-from rsvib_torch.restoration.exact.priors import PRIORS, check_prior
-from rsvib_torch.restoration.exact.scene_solver import (
-    MIN_LEVEL,
-    MOST_THREADS,
-    SceneProblem,
-    most_values,
-    solver_threads,
-)
-from rsvib_torch.restoration.frame_motion import MovingFrames, joint_groups
-from rsvib_torch.restoration.noise import noise_levels
-from rsvib_torch.restoration.scene_model.cross_validation import prior_strengths
-from rsvib_torch.restoration.scene_model.finer_grid import GRIDS, PolynomialPrior, fit_polynomial_prior
-from rsvib_torch.restoration.scene_model.observation import SCENE_REACH, TAPS, RowKernels
-from rsvib_torch.restoration.scene_model.scene_prior import RowPrior, brightness, fit_prior
 
 _FRAME_BYTES = 2**26  # frames of scenes that are treated at a time on a CPU, beside the systems
 
@@ -80,17 +80,22 @@ def restore_exact(frames: MovingFrames, options: ExactOptions) -> Tensor:
 
     # 5. On the finer grid, frames that contradict their scene show that the motion is wrong.
     if options.scale != 1:
-        warn_of_frames(differences, model.places(scenes))
+        displacement, node_weights = frames.motion.exposures
+        places = (displacement.detach() * node_weights[:, None]).sum(-2)
+        warn_of_frames(differences, [places[one, some] for one, some in zip(scenes.stack, scenes.members, strict=True)])
     return images.unflatten(0, (len(frames.images), -1))
 
 
 @dataclass(frozen=True, eq=False)
 class Scenes:
-    """N scenes, each restored from M frames of a stack."""
+    """N scenes, each restored from M frames of a stack, in the coordinates of one of them."""
 
-    stack: NDArray[np.int64]  # (N,) number of the stack
+    stack: NDArray[np.int64]  # (N, 1) number of the stack
     members: NDArray[np.int64]  # (N, M) numbers of the frames
-    reference: NDArray[np.int64]  # (N,) the frame in whose coordinates a scene is restored
+    shift: NDArray[np.float64]  # (N, 1, 2) px, that of the frame in whose coordinates a scene is restored
+    moved: NDArray[np.float64]  # (N, M, 2) px by which the frames are moved relative to that one
+    blur_reach: NDArray[np.float64]  # (N,) px, largest distance along the row during an exposure from its middle
+    complete: NDArray[np.bool_]  # (N,) whether all pixels of the frames are measured
     contributes: NDArray[np.bool_]  # (N, M) whether the frame has enough measured pixels
     strength: NDArray[np.float64]  # (N,) factor on the prior
 
@@ -108,90 +113,67 @@ class FrameModel(MovingFrames):
     scale: int  # points of the restored scenes per px
     unknown: Tensor | None  # (B, T, C, H, W) bool, pixels without data and saturated ones; None for none
 
-    @cached_property
-    def measured(self) -> NDArray[np.float64]:
-        """Share (B, T) of the pixels of each frame that are measured."""
-        if self.unknown is None:
-            return np.ones(self.images.shape[:2])
-        return 1.0 - self.unknown.double().flatten(2).mean(2).cpu().numpy()
-
     def scenes(self, groups: list[tuple[list[int], int]]) -> Scenes:
         """The scenes that are restored from groups of frames (``joint_groups``), stack after stack."""
-        stack = np.arange(len(self.images)).repeat(len(groups))
-        members = np.tile([members for members, _ in groups], (len(self.images), 1))
-        reference = np.tile([reference for _, reference in groups], len(self.images))
-        contributes = np.ones(members.shape, dtype=bool)
+        count = len(self.images)
+        stack = np.arange(count).repeat(len(groups))[:, None]
+        members = np.tile([members for members, _ in groups], (count, 1))
+        reference = np.tile([[reference] for _, reference in groups], (count, 1))
+        shift = table(self.motion.shift)
+        blur_reach = 0.5 * self.motion.blur_lengths[stack, members, 0].max(1)
+        measured = np.ones(members.shape)
         if self.unknown is not None:
-            # frames with at most 5 % measured pixels do not contribute, unless there are no others
-            contributes = self.measured[stack[:, None], members] > 0.05
-            contributes |= ~contributes.any(1, keepdims=True)
-        return Scenes(stack, members, reference, contributes, np.ones(len(stack)))
+            measured = 1.0 - table(self.unknown.double().flatten(2).mean(2))[stack, members]
+        # frames with at most 5 % measured pixels do not contribute, unless there are no others
+        contributes = measured > 0.05
+        contributes |= ~contributes.any(1, keepdims=True)
+        moved = shift[stack, members] - shift[stack, reference]
+        complete = (measured == 1).all(1)
+        strength = np.ones(len(stack))
+        return Scenes(stack, members, shift[stack, reference], moved, blur_reach, complete, contributes, strength)
 
     def _indices(self, scenes: Scenes) -> tuple[Tensor, Tensor]:
         """Stack (N, 1) and members (N, M), to index frames."""
         device = self.images.device
-        return torch.as_tensor(scenes.stack[:, None], device=device), torch.as_tensor(scenes.members, device=device)
-
-    @cached_property
-    def _shift(self) -> NDArray[np.float64]:
-        return table(self.motion.shift)
-
-    def _moved(self, scenes: Scenes) -> NDArray[np.float64]:
-        """(N, M, 2) px by which the frames are moved along (x, y) relative to the restored one."""
-        moved: NDArray[np.float64] = self._shift[scenes.stack[:, None], scenes.members]
-        return moved - self._shift[scenes.stack, scenes.reference][:, None]
+        return torch.as_tensor(scenes.stack, device=device), torch.as_tensor(scenes.members, device=device)
 
     def _row_kernels(self, scenes: Scenes) -> RowKernels:
         """Kernels of the frames of scenes, in the coordinates of their reference; 0 where frames do not contribute."""
         index = self._indices(scenes)
         displacement, node_weights = self.motion.exposures
-        shift = torch.as_tensor(self._shift[scenes.stack, scenes.reference], device=displacement.device)
-        moved = (displacement[index] - shift.view(-1, 1, 1, 1, 2)).flatten(0, 1)
+        shift = torch.as_tensor(scenes.shift[:, :, None, None], device=displacement.device)
         weights = self.weights[index] * torch.as_tensor(scenes.contributes, device=displacement.device)
-        return GRIDS[self.scale].kernels_of_rows(moved, node_weights, weights.flatten(), self.images.shape[-2])
-
-    def places(self, scenes: Scenes) -> list[Tensor]:
-        """Mean displacement (M, R, 2) of the rows of the frames of each scene."""
-        displacement, node_weights = self.motion.exposures
-        mean = (displacement.detach() * node_weights[:, None]).sum(-2)
-        return [mean[stack, members] for stack, members in zip(scenes.stack, scenes.members, strict=True)]
-
-    def _blur_reaches(self, scenes: Scenes) -> NDArray[np.float64]:
-        """Largest distance (N,) along the row in px during an exposure from its middle."""
-        return 0.5 * self.motion.blur_lengths[scenes.stack[:, None], scenes.members, 0].max(1)
+        moved = (displacement[index] - shift).flatten(0, 1)
+        height = self.images.shape[-2]
+        return RowKernels.of_rows(moved, node_weights, weights.flatten(), height, points=self.scale)
 
     def strengths(self, scenes: Scenes) -> NDArray[np.float64]:
-        """Factors (N,) on the priors, estimated from those frames whose columns are the same as in the restored one."""
+        """Factors (N,) on the priors: one for each stack, or strips of the same frames, estimated from its first scene.
+
+        Those of its frames whose columns are the same as in the restored one are used.
+        """
         if not isinstance(self.prior, RowPrior):
             return np.ones(len(scenes.stack))  # the strength of other priors is not selected
-        same = scenes.contributes & (self._moved(scenes) == 0).all(-1)
-        # frames of the same stack, and of strips of the same frames, with the same noise to 20 % have one strength
-        weights, level, interpolation = tables(self.weights, self.level, self.prior.interpolation_power.mean(-1))
-        place = scenes.stack[:, None], scenes.members
-        weight = (weights[place] * same).sum(1) / same.sum(1)
-        noise = np.log(level[scenes.stack] ** 2 / weight + interpolation[place].mean(1))
-        chosen: list[int] = []
-        representative = []
-        for number, stack in enumerate(scenes.stack // self.strips):
-            of_frames = (one for one in chosen if scenes.stack[one] // self.strips == stack)
-            found = next((one for one in of_frames if abs(noise[one] - noise[number]) < 0.2), number)
-            chosen += [found] if found == number else []
-            representative.append(found)
+        _, first, of_scenes = np.unique(scenes.stack[:, 0] // self.strips, return_index=True, return_inverse=True)
+        chosen = take_stacks([scenes], first)
+        chosen = replace(chosen, contributes=chosen.contributes & (chosen.moved == 0).all(-1))
         # cross-validation of as many scenes at a time as the memory allows
         scene_bytes = 4 * self.images[0, 0].numel() * scenes.members.shape[1]
-        strengths = np.ones(len(scenes.stack))
-        for part in runs(len(chosen), at_once(scene_bytes, self.images.device, cpu_bytes=_FRAME_BYTES)):
-            some = replace(take_stacks([scenes], np.array(chosen[part])), contributes=same[chosen[part]])
+        strengths = []
+        for part in runs(len(first), at_once(scene_bytes, self.images.device, cpu_bytes=_FRAME_BYTES)):
+            some = take_stacks([chosen], np.arange(part.start, part.stop))
             stack_of, member_of = self._indices(some)
-            strengths[chosen[part]] = prior_strengths(
+            found = prior_strengths(
                 self.images[stack_of, member_of],
                 self._row_kernels(some),
                 self.prior.of(stack_of[:, 0], member_of),
                 self.level[stack_of].square(),
-                torch.from_numpy(self._blur_reaches(some)[:, None]).to(self.images.device),
+                torch.as_tensor(some.blur_reach[:, None], device=self.images.device),
                 certain=self.level_is_certain,
             )
-        return strengths[representative]
+            strengths.append(found)
+        result: NDArray[np.float64] = np.concatenate(strengths)[of_scenes]
+        return result
 
     def kinds(self, scenes: Scenes) -> list[str]:
         """What is missing in the data of each scene: ``"pixels"``, only the ``"extension"``, or ``"nothing"``.
@@ -200,12 +182,12 @@ class FrameModel(MovingFrames):
         have no weight. On the finer grid, extensions of different frames contradict each other beyond half a cycle per
         px: filled, 49.9 dB become 53.9 dB (8 frames of 256 px, noise 0.002).
         """
-        outer = np.isin(scenes.stack % self.strips, (0, self.strips - 1))
-        ends = (outer & (self._blur_reaches(scenes) > FILLED_BLUR_REACH)) | (self.scale > 1)
-        incomplete = (self.measured[scenes.stack[:, None], scenes.members] < 1).any(1)
-        moved = self._moved(scenes)[..., 0].any(1)
-        kinds = np.where(moved | incomplete, "pixels", np.where(ends, "extension", "nothing"))
-        return [kind + (" and ends" if kind == "pixels" and end else "") for kind, end in zip(kinds, ends, strict=True)]
+        outer = np.isin(scenes.stack[:, 0] % self.strips, (0, self.strips - 1))
+        ends = (outer & (scenes.blur_reach > FILLED_BLUR_REACH)) | (self.scale > 1)
+        pixels = ~scenes.complete | scenes.moved[..., 0].any(1)
+        whole = np.where(ends, "pixels and ends", "pixels")
+        kinds: list[str] = np.where(pixels, whole, np.where(ends, "extension", "nothing")).tolist()
+        return kinds
 
     def problem(self, scenes: Scenes, kind: str) -> SceneProblem:
         """The least-squares problem of scenes of one kind, with its missing values filled."""
@@ -217,15 +199,15 @@ class FrameModel(MovingFrames):
 
         # Observation operator, and precision of the prior.
         kernels = self._row_kernels(scenes)
-        observation = GRIDS[self.scale](kernels, self.images.shape[-2], self.period, data.dtype, len(data))
+        observation = Observation(kernels, self.images.shape[-2], self.period, data.dtype, len(data))
         level = self.level[stack_of]
         if isinstance(self.prior, RowPrior):
-            factors = np.stack([scenes.strength, self._blur_reaches(scenes)])[..., None]
+            factors = np.stack([scenes.strength, scenes.blur_reach])[..., None]
             strength, reach = torch.as_tensor(factors, dtype=data.dtype, device=data.device)
             prior = self.prior.of(stack_of, index[1])
             precision = prior.precision(level[:, None].square(), strength, reach)
         else:
-            polynomial = self.prior[int(scenes.stack[0])]
+            polynomial = self.prior[int(scenes.stack[0, 0])]
             precision = polynomial.precision(level[0].square(), float(scenes.strength[0]), kernels.blur_reach)
         problem = SceneProblem(data, observation, precision, level)
 
@@ -234,7 +216,7 @@ class FrameModel(MovingFrames):
             return problem
         if kind == "extension":
             return with_extension(problem, width)
-        along = torch.as_tensor(self._moved(scenes)[..., 0], device=data.device)
+        along = torch.as_tensor(scenes.moved[..., 0], device=data.device)
         unknown = None if self.unknown is None else self.unknown[index]
         measured = measured_values(along, unknown, data.shape, width, ends=kind.endswith("ends"))
         floor = None
@@ -303,7 +285,7 @@ def solve_scenes(model: FrameModel, scenes: Scenes, options: ExactOptions) -> tu
         else:
             deviations, difference = finer_scene(problem, width, model.motion.neglected)
             differences.append(difference)
-        found.update(zip(numbers, deviations[..., : model.scale * width] + model.mean[some.stack], strict=True))
+        found.update(zip(numbers, deviations[..., : model.scale * width] + model.mean[some.stack[:, 0]], strict=True))
         advance(len(numbers))
 
     if torch.is_grad_enabled() and (model.images.requires_grad or model.motion.exposures[0].requires_grad):
@@ -325,10 +307,10 @@ def _blocks(model: FrameModel, scenes: Scenes) -> list[tuple[str, list[int]]]:
     frequencies, rows = model.period // 2 + 1, height + 2 * SCENE_REACH
     across = math.ceil(float(model.motion.blur_lengths[..., 1].max()))
     systems = rows * (2 * (TAPS - 1 + across) + 1) * frequencies
-    most = most_values(rows, frequencies, device, blurred=False, single=False) // systems
+    most = most_values(device) // systems
     scene_bytes = 4 * scenes.members.shape[1] * model.images.shape[2] * height * model.period
     most = max(1, min(most, at_once(scene_bytes, device, cpu_bytes=_FRAME_BYTES)))
-    threads = solver_threads(device)
+    threads = min(allowed_threads(), MOST_THREADS) if device.type == "cpu" else 1
     return [
         (kind, numbers[part])
         for kind, numbers in of_kind.items()

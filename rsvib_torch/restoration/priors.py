@@ -12,8 +12,8 @@ from torch.nn import functional
 from rsvib_torch.checks.values import check_choice
 from rsvib_torch.execution.chunking import runs
 from rsvib_torch.execution.parallel import in_parallel
-from rsvib_torch.restoration.exact.scene_solver import SceneProblem
-from rsvib_torch.restoration.scene_model.observation import KERNEL_REACH, kernel_samples
+from rsvib_torch.restoration.observation import KERNEL_REACH, kernel_samples
+from rsvib_torch.restoration.scene_solver import SceneProblem
 
 _PATCH, _STEP = 8, 2  # px, size and distance of patches; chosen together with the stages of the prior
 _NEIGHBOURS = _PATCH // _STEP  # patches that begin before the next one that shares no pixel

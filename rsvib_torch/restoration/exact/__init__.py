@@ -1,1 +1,0 @@
-"""Exact restoration: all rows of all frames are solved together, frequency by frequency."""

@@ -1,1 +1,0 @@
-"""Verdict on a restoration, without knowledge of the true scene."""
