@@ -332,7 +332,7 @@ _SHAPES = {
     ),
     "readout_contradicted": _px(
         "path and tones leave {value:.2g} px of the motion of corners, and {limit:.2g} px if the rows are read {other}",
-        "check row_time and the readout direction",
+        "check row_time, frame_rate (of slow motion: that of the camera), readout_direction and scan_axis",
         "residual of the corners of a video with the stated and with another readout, whose square is smaller by a "
         "tenth or more",
     ),

@@ -12,7 +12,7 @@ is not of the layer of the corners, which a subject on 40 % of the frame would m
 import math
 from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 
@@ -77,6 +77,10 @@ class Tone:
     coefficient: complex  # px; the displacement is Re c exp(2 pi i f t)
     amplitude_std: float  # px
     frequency_std: float  # Hz
+
+    def within(self, part: float) -> "Tone":
+        """How it displaces the rows of a frame that take a part of the time of the stated readout."""
+        return replace(self, frequency=part * self.frequency)
 
 
 @dataclass(eq=False)
@@ -176,7 +180,8 @@ class WindowPath:
     # how the rows are read instead, if the corners contradict the stated readout, and px, median residuals by the path
     # with the stated and with this readout
     other_readout: tuple[str, float, float] | None
-    is_of_other: bool  # whether the path is that with this readout, because its rows are displaced along another path
+    # part of the stated time of the readout, by which the path and the tones displace the rows; 0: as columns do
+    part: float
     agreeing: tuple[str, ...]  # other readouts that explain the corners as well, and the frequencies of their tones
 
     def path(self, times: Array, derivative: int = 0) -> Array:
@@ -465,7 +470,7 @@ class WindowFit:
         self,
         other_readout: tuple[str, float, float] | None = None,
         *,
-        is_of_other: bool = False,
+        part: float = 1.0,
         agreeing: tuple[str, ...] = (),
     ) -> WindowPath:
         """The result of the fit; the arguments are those of ``WindowPath``."""
@@ -474,7 +479,7 @@ class WindowFit:
         if not self.layer.all():  # with a subject on 40 % of the frame, tones of 0.1 px were found that are none
             residual_of_most = float(np.quantile(self.distance, 0.8)) / _FOUR_FIFTHS
         of_window, of_fit = (self.origin, self.start, self.step, knots, tuple(self.tones)), (residual, residual_of_most)
-        return WindowPath(*of_window, *of_fit, other_readout, is_of_other, agreeing)
+        return WindowPath(*of_window, *of_fit, other_readout, part, agreeing)
 
     def is_apart_from(self, frequency: float, others: Array) -> NDArray[np.bool_]:
         """Whether other frequencies are not those of a tone, nor of a change of its amplitude."""

@@ -113,7 +113,7 @@ class VideoPasses:
             places = path.places(found.taken)
             shift = self._to_steady(times, lambda number, others: places[others] - places[number], found.cuts)
             polynomials = np.stack([path.derivatives(found.taken, 1), path.derivatives(found.taken, 2), shift], 1)
-            polynomials[:, :2] *= path.displaces_rows and not self.stabilised
+            polynomials[:, :2] *= not self.stabilised
 
             def by_corners(index: int) -> Vibration:
                 return self._removed(path.tones(float(found.taken[index])), polynomials[index])
@@ -277,7 +277,7 @@ class VideoPasses:
         unknown = np.full(2, math.inf)
         values = (size, rate, period_std, phase_std, unknown, unknown)
         begin = times[[tracks[0].index]]
-        velocity, acceleration = (path.derivatives(begin, order)[0, :2] for order in (1, 2))
+        velocity, acceleration = (window.path(begin, order)[0, :2] for order in (1, 2))
         vibration = Vibration(amplitude, frequency, phase, velocity, acceleration)
         findings = self._findings(tones, window)
         copies = np.count_nonzero(np.diff(times) <= 0) / len(times)
