@@ -225,6 +225,7 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
                 where = number_of(len(notes), "window")
                 restoration.append(wrapped(f"{name} unchanged in {where}; in window {window}: {note['text']}"))
         if "video" in self.settings and not still:
+            axes: dict[str, list[str]] = {}  # that are refused, by the text
             for axis, name in enumerate(AXIS_NAMES[:2]):
                 against = {
                     record.window: [one for one in record.detection.findings[axis] if one.code != "no_tone"]
@@ -234,8 +235,11 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
                 refused = {number: "; ".join(map(str, why)) for number, why in against.items() if why}
                 if refused:
                     number, why = next(iter(refused.items()))
-                    text = f"{name} is restored as measured, but is not reliable in"
-                    vibration.append(wrapped(f"{text} {number_of(len(refused), 'window')}; in window {number}: {why}"))
+                    text = f"not reliable in {number_of(len(refused), 'window')}; in window {number}: {why}"
+                    axes.setdefault(text, []).append(name)
+            for text, names in axes.items():
+                verb = "is" if len(names) == 1 else "are"
+                vibration.append(wrapped(f"{' and '.join(names)} {verb} restored as measured, but {text}"))
             assumed = [str(one) for found in self.detections() if found is not None for one in found.assumptions]
             vibration += [wrapped(f"assumed: {one}") for one in assumed[:1]]
         return vibration, restoration

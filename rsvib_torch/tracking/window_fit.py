@@ -98,6 +98,15 @@ class WindowTone:
     frequency_std: float = math.inf  # Hz
     apart: float = 0.0  # largest part of the tone that is left in a third of the rows or columns
 
+    @property
+    def size(self) -> float:
+        """Mean amplitude (rms) in px."""
+        return math.sqrt(np.square(np.abs(self.knots)).mean())
+
+    def bend(self, part: slice = slice(None)) -> float:
+        """What the spline does not follow near some of the knots, in px."""
+        return 0.25 * float(np.abs(np.diff(self.knots[part], 2)).max())
+
     def at(self, time: float, origin: float, weight: float = 1.0) -> Tone:
         """The tone as it is at a time in s, with the time origin of its phase, multiplied by a weight."""
         index, factors = spline_taps(np.array([time]), self.start, self.step, len(self.knots))
@@ -105,7 +114,7 @@ class WindowTone:
         turns = frequency * origin - 0.5 * self.slope * time**2
         turned = (factors * self.knots[index]).sum() * np.exp(2j * math.pi * turns)
         # What a spline does not follow: behind a blow that decays with 0.1 s, amplitudes were wrong by 6 to 20 std.
-        bent = 0.25 * float(np.abs(np.diff(self.knots[index.min() : index.max() + 1], 2)).max())
+        bent = self.bend(slice(index.min(), index.max() + 1))
         bent = math.sqrt(max(bent**2 - 0.375 * min(self.amplitude_std, 1e9) ** 2, 0.0))  # without that of noise
         size_std = math.hypot(self.amplitude_std, bent)
         phase = bent / max(abs(turned), bent, 1e-30)
@@ -456,11 +465,10 @@ class WindowFit:
         def is_kept(tone: WindowTone, wave: NDArray[np.complex128]) -> bool:
             least = _NEARLY_BLIND if tone.apart > _MAX_APART else _MIN_GAIN
             is_visible = abs(tone.slope) > _FAST or _gain(tone.frequency, self.interval) > least
-            size = math.sqrt(np.square(np.abs(tone.knots)).mean())
             return bool(
                 is_visible
                 and tone.apart < _MOST_APART
-                and size > SIGNIFICANT * tone.amplitude_std
+                and tone.size > SIGNIFICANT * tone.amplitude_std
                 and 0.5 * np.square(np.abs(wave)).mean() > _MIN_EXPLAINED**2
             )
 
