@@ -225,7 +225,7 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
                 where = number_of(len(notes), "window")
                 restoration.append(wrapped(f"{name} unchanged in {where}; in window {window}: {note['text']}"))
         if "video" in self.settings and not still:
-            axes: dict[str, list[str]] = {}  # that are refused, by the text
+            of_text: dict[str, list[str]] = {}  # the axes against which the same is stated
             for axis, name in enumerate(AXIS_NAMES[:2]):
                 against = {
                     record.window: [one for one in record.detection.findings[axis] if one.code != "no_tone"]
@@ -236,10 +236,9 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
                 if refused:
                     number, why = next(iter(refused.items()))
                     text = f"not reliable in {number_of(len(refused), 'window')}; in window {number}: {why}"
-                    axes.setdefault(text, []).append(name)
-            for text, names in axes.items():
-                verb = "is" if len(names) == 1 else "are"
-                vibration.append(wrapped(f"{' and '.join(names)} {verb} restored as measured, but {text}"))
+                    of_text.setdefault(text, []).append(name)
+            for text, names in of_text.items():
+                vibration.append(wrapped(f"{' and '.join(names)} restored as measured, but {text}"))
             assumed = [str(one) for found in self.detections() if found is not None for one in found.assumptions]
             vibration += [wrapped(f"assumed: {one}") for one in assumed[:1]]
         return vibration, restoration

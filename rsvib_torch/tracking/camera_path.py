@@ -1,7 +1,7 @@
 """The path and the vibration of a camera over all frames of a video, from overlapping windows of frames."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -45,20 +45,18 @@ class CameraPath:
         return np.concatenate([np.zeros((1, 4)), np.cumsum(steps, 0)])
 
     def derivatives(self, times: Array, order: int) -> Array:
-        """(N, 4) first or second derivative of what displaces the rows of frames, per s or s^2 of the stated readout.
-
-        It is that of the components of the path, unless their corners contradict the stated readout.
-        """
+        """(N, 4) first or second derivative of the path, per s or s^2 of the stated readout of the rows."""
         return self._mean(times, lambda window: window.part**order * window.path(times, order))
 
     def tones(self, time: float) -> list[Tone]:
         """Tones that displace the rows, around a time in s, which is the origin of their phases."""
         weights = self._weights(np.array([time]))[:, 0]
         return [
-            tone.at(time - window.origin, time - window.origin, float(weight)).within(window.part)
+            replace(found, frequency=window.part * found.frequency)
             for weight, window in zip(weights, self.windows, strict=True)
             if weight > 0 and window.part > 0
             for tone in window.tones
+            for found in [tone.at(time - window.origin, time - window.origin, float(weight))]
         ]
 
     def nearest(self, time: float) -> WindowPath:

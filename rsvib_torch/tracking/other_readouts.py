@@ -19,7 +19,6 @@ from rsvib_torch.tracking.window_fit import MIN_RATIO, ROUNDS, SearchedFrequenci
 
 _WITHOUT_TONES = 0.5, 0.7, 1.4, 2.0  # parts of the time of a readout that are compared where there are no tones
 _LEAST_PART = 0.4  # of those that tones propose; row times are guessed from the frame rate or a table
-_MOST_NAMED = 3  # readouts that explain the corners alike
 # By how much the square of what the path leaves is less if the stated readout is wrong. 55 clips in H.264, a phone, and
 # a drone: at most 1.06 with the right row time, but for 1.20 and 1.33 where corners are few or not explained; 1.19 to 5
 # with 16 wrong ones, 0.5 to 2 times the right one, which tones then propose within 0.5 %
@@ -116,13 +115,9 @@ class _Readouts:
     waves: list[_Wave]
 
     def parts(self) -> list[float]:
-        """Parts of the stated time that are compared; -1 if rows are read in reverse.
-
-        With most of them each wave is one tone, but not the same one as with the stated time. Rows are not read in more
-        time than there is between two frames.
-        """
+        """Parts of the stated time with which each wave is one tone, but not the same one; -1: rows are in reverse."""
         interval = self.fit.interval
-        most = max(interval / self.readout, 1.0)
+        most = max(interval / self.readout, 1.0)  # rows are not read in more time than there is between two frames
         proposed = sorted(part for wave in self.waves for part in wave.parts(interval, most))
         others = [
             part
@@ -146,21 +141,11 @@ class _Readouts:
         other.solve(rounds)
         return other
 
-    def with_its_tones(self, part: float) -> str:
-        """How the rows are read, and the frequencies of the tones."""
-        tones = dict.fromkeys(f"{wave.alias(part, self.fit.interval):.4g}" for wave in self.waves)
-        return f"{_name(part)}, with tones of {', '.join(tones)} Hz"
-
-
-def _name(part: float) -> str:
-    return {-1.0: "in reverse", 0.0: "all at once"}.get(part, f"in {part:.2f} times the time")
-
 
 def _by_columns(fit: WindowFit, readout: float, timing: SensorTiming, size: tuple[int, int]) -> WindowFit:
     """The path of the corners of frames (H, W) if columns are read one after another, in the time of all rows."""
     corners, axis = fit.corners, -1 - int(timing.scan_axis)
-    ends = corners.places[:, None] + np.array([[-0.5], [0.5]]) * corners.offsets[:, None]
-    ends /= np.array(size[::-1])
+    ends = (corners.places[:, None] + np.array([[-0.5], [0.5]]) * corners.offsets[:, None]) / np.array(size[::-1])
     rows, columns = ends[..., axis] * (1 if timing.readout_direction == "forward" else -1), ends[..., 1 - axis]
     times = corners.times + readout * (columns - rows)
     path = WindowFit(replace(corners, rows=columns[:, 0] + 0.5, times=times), fit.interval, fit.averaged)
@@ -174,13 +159,18 @@ def compared_readouts(fit: WindowFit, timing: SensorTiming, size: tuple[int, int
 
     The frames are of size (H, W); a fit that leaves more than ``allowed`` in px does not explain the corners.
     """
+
+    def name(part: float) -> str:
+        return {-1.0: "in reverse", 0.0: "all at once"}.get(part, f"in {part:.2f} times the time")
+
+    def with_its_tones(part: float) -> str:
+        tones = dict.fromkeys(f"{wave.alias(part, fit.interval):.4g}" for wave in rows.waves)
+        return f"{name(part)}, with tones of {', '.join(tones)} Hz"
+
     # 1. Readouts of the rows, and of the columns, and the waves that they may explain.
     readout = timing.row_time * size[int(timing.scan_axis)]
-    is_explained = fit.path().residual < allowed
-    rows, columns = (
-        _Readouts(one, readout, _waves(one, readout, is_explained))
-        for one in (fit, _by_columns(fit, readout, timing, size))
-    )
+    fits, is_explained = (fit, _by_columns(fit, readout, timing, size)), fit.path().residual < allowed
+    rows, columns = (_Readouts(one, readout, _waves(one, readout, is_explained)) for one in fits)
     # 2. The best of them after one round, from the weights of the stated readout, must leave less in a robust fit. It
     # may do so by waves that have not been found as tones with the stated readout.
     left = {(of, part): of.with_part(part, 1).unexplained for of in (rows, columns) for part in of.parts()}
@@ -190,10 +180,10 @@ def compared_readouts(fit: WindowFit, timing: SensorTiming, size: tuple[int, int
     if least > fit.unexplained or least > rows.with_part(1.0, ROUNDS).unexplained:
         most = _AS_WELL * fit.unexplained if fit.tones else 0.0
         agreeing = [part for (of, part), value in left.items() if of is rows and 0 < part != 1 and value < most]
-        return fit.path(agreeing=tuple(map(rows.with_its_tones, sorted(agreeing, key=lambda one: abs(math.log(one))))))
+        return fit.path(agreeing=tuple(map(with_its_tones, sorted(agreeing, key=lambda one: abs(math.log(one))))))
     # 3. Frames whose columns are read one after another are moved as a whole.
     most = _CONTRADICTED * left[of, part]
     alike = sorted((value, one) for (its, one), value in left.items() if its is of is rows and value < most)
-    names = " or ".join([*dict.fromkeys(_name(one) for _, one in alike)][:_MOST_NAMED]) or "column by column"
-    residuals = math.sqrt(fit.unexplained), math.sqrt(other.unexplained)
-    return other.path((names, *residuals), part=part if of is rows else 0.0)
+    names = " or ".join([*dict.fromkeys(name(one) for _, one in alike)][:3]) or "column by column"
+    found = names, math.sqrt(fit.unexplained), math.sqrt(other.unexplained)
+    return other.path(found, part=part if of is rows else 0.0)

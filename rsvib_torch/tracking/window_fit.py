@@ -12,7 +12,7 @@ is not of the layer of the corners, which a subject on 40 % of the frame would m
 import math
 from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 
@@ -77,10 +77,6 @@ class Tone:
     coefficient: complex  # px; the displacement is Re c exp(2 pi i f t)
     amplitude_std: float  # px
     frequency_std: float  # Hz
-
-    def within(self, part: float) -> "Tone":
-        """How it displaces the rows of a frame that take a part of the time of the stated readout."""
-        return replace(self, frequency=part * self.frequency)
 
 
 @dataclass(eq=False)

@@ -366,9 +366,9 @@ class VideoPasses:
             # Where frames are missing, the phase of a tone jumps, and others of 0.1 to 0.2 px seem to be beside it:
             # 0.75 to 0.8 of the tone are not followed, of one that is switched on and off 0.6, at most 0.21 in 14 clips
             largest = max(of_window, key=lambda tone: tone.size, default=None)
-            if largest is not None and largest.bend() > largest.size / SIGNIFICANT:
-                bend, limit, details = largest.bend(), largest.size / SIGNIFICANT, {"frequency": largest.frequency}
-                against = [Reason("tone_changes", name, bend, limit, details), *aliases[:1]]
+            if largest is not None and largest.bend() > (limit := largest.size / SIGNIFICANT):
+                frequency = {"frequency": largest.frequency}
+                against = [Reason("tone_changes", name, largest.bend(), limit, frequency), *aliases[:1]]
             if apart > _MAX_APART:
                 against.append(Reason("rows_differ", name, apart, _MAX_APART))
             fastest = max((tone.frequency for tone in of_axis), default=0.0)
