@@ -114,6 +114,7 @@ _OPTIONS = {
     "check exposure_rows": "check --exposure",
     "frame_rows and row_time, which": "--frame-rate and --row-time, which",
     "check row_time": "check --row-time",
+    "scan_axis, readout_direction": "--scan-axis, --readout-direction",
     "increase search": "increase search in [detection]",
     "pass row_time=(low, high)": "give --row-time twice",
     "scan_axis=": "--scan-axis ",
@@ -210,6 +211,11 @@ _TONES = {
         "check row_time and the readout direction",
         "frequencies of two tones of a video, whose difference is a multiple of the frame rate",
         "Hz",
+    ),
+    "tone_changes": _px(
+        "tone of {frequency:.4g} Hz changes by {value:.2g} px faster than it is followed, {limit:.2g} px are allowed",
+        "if frames are missing, use the video as the camera recorded it",
+        "what a spline does not follow of the largest tone of a video, above a third of its mean amplitude",
     ),
     "tone_averaged_out": ReasonKind(
         "tone of {value:.4g} Hz is above 1/T_e = {limit:.4g} Hz, where the exposure averages it out",
@@ -312,7 +318,7 @@ _SHAPES = {
     ),
     "readout_contradicted": _px(
         "path and tones leave {value:.2g} px of the motion of corners, and {limit:.2g} px if the rows are read {other}",
-        "check row_time and the readout direction",
+        "check row_time, scan_axis, readout_direction, and the frame rate: of slow motion, that of the camera",
         "residual of the corners of a video with the stated and with another readout, whose square is smaller by a "
         "tenth or more",
     ),

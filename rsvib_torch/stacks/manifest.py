@@ -195,6 +195,7 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
                 where = number_of(len(notes), "window")
                 restoration.append(wrapped(f"{name} unchanged in {where}; in window {window}: {note['text']}"))
         if "video" in self.settings and not still:
+            of_text: dict[str, list[str]] = {}  # the axes against which the same is stated
             for axis, name in enumerate(AXIS_NAMES[:2]):
                 against = {
                     record.window: [one for one in record.detection.findings[axis] if one.code != "no_tone"]
@@ -204,8 +205,10 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
                 refused = {number: "; ".join(map(str, why)) for number, why in against.items() if why}
                 if refused:
                     number, why = next(iter(refused.items()))
-                    text = f"{name} is restored as measured, but is not reliable in"
-                    vibration.append(wrapped(f"{text} {number_of(len(refused), 'window')}; in window {number}: {why}"))
+                    text = f"not reliable in {number_of(len(refused), 'window')}; in window {number}: {why}"
+                    of_text.setdefault(text, []).append(name)
+            for text, names in of_text.items():
+                vibration.append(wrapped(f"{' and '.join(names)} restored as measured, but {text}"))
             assumed = [str(one) for found in self._tones if found is not None for one in found.assumptions]
             vibration += [wrapped(f"assumed: {one}") for one in assumed[:1]]
         return vibration, restoration

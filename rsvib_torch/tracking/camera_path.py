@@ -1,7 +1,7 @@
 """The path and the vibration of a camera over all frames of a video, from overlapping windows of frames."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,11 +26,6 @@ class CameraPath:
     windows: tuple[WindowPath, ...]
     allowed: float  # px, residual of a window that is explained
 
-    @property
-    def displaces_rows(self) -> bool:
-        """Whether the rows are displaced along the path as their readout is stated."""
-        return 2 * sum(window.is_of_other for window in self.windows) < len(self.windows)
-
     def _weights(self, times: Array) -> Array:
         """(W, N) weights of the windows at times, which change linearly between the middles of neighbours."""
         centres = [window.origin for window in self.windows]
@@ -50,17 +45,18 @@ class CameraPath:
         return np.concatenate([np.zeros((1, 4)), np.cumsum(steps, 0)])
 
     def derivatives(self, times: Array, order: int) -> Array:
-        """(N, 4) first or second derivative of the components of the path, per s or s^2."""
-        return self._mean(times, lambda window: window.path(times, order))
+        """(N, 4) first or second derivative of the path, per s or s^2 of the stated readout of the rows."""
+        return self._mean(times, lambda window: window.part**order * window.path(times, order))
 
     def tones(self, time: float) -> list[Tone]:
-        """Tones around a time in s, which is the origin of their phases."""
+        """Tones that displace the rows, around a time in s, which is the origin of their phases."""
         weights = self._weights(np.array([time]))[:, 0]
         return [
-            tone.at(time - window.origin, time - window.origin, float(weight))
+            replace(found, frequency=window.part * found.frequency)
             for weight, window in zip(weights, self.windows, strict=True)
-            if weight > 0
+            if weight > 0 and window.part > 0
             for tone in window.tones
+            for found in [tone.at(time - window.origin, time - window.origin, float(weight))]
         ]
 
     def nearest(self, time: float) -> WindowPath:
@@ -84,7 +80,7 @@ def camera_path(
         known = [pair for pair in waiting if pair is not None]
         if len(known) >= max(2, len(waiting) // 4):
             found = fit_window(Corners.joined(known), timing.frame_period, averaged, readout, has_tones)
-            window = compared_readouts(found, readout) if has_tones else found.path()
+            window = compared_readouts(found, timing, size, allowed) if has_tones else found.path()
             windows.extend(swept(window) or [window])
 
     def swept(window: WindowPath) -> list[WindowPath]:

@@ -13,22 +13,26 @@ from itertools import pairwise
 
 import numpy as np
 
+from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.tracking.window_fit import MIN_RATIO, ROUNDS, SearchedFrequencies, WindowFit, WindowPath
 
 _WITHOUT_TONES = 0.5, 0.7, 1.4, 2.0  # parts of the time of a readout that are compared where there are no tones
-_LEAST_PART, _MOST_PART = 0.4, 2.5  # of those that tones propose; row times are guessed from the frame rate or a table
+_LEAST_PART = 0.4  # of those that tones propose; row times are guessed from the frame rate or a table
 # By how much the square of what the path leaves is less if the stated readout is wrong. 55 clips in H.264, a phone, and
 # a drone: at most 1.06 with the right row time, but for 1.20 and 1.33 where corners are few or not explained; 1.19 to 5
 # with 16 wrong ones, 0.5 to 2 times the right one, which tones then propose within 0.5 %
 _CONTRADICTED = 1.12
+# Likewise by the path alone: with the right row time 1.24 of a zoom that vibrates and 1.16 of parallax, at most 1.01 in
+# 16 other clips; 1.36 to 3.7 in nine of 18 clips with 0.5 to 1.4 times the right one, whose rows wobble by the hand
+_BY_PATH = 1.3
 # Of what the stated readout leaves, up to which another one explains the corners as well: 1.00 without a hand. Of 22
 # clips of a hand with tones, 11 leave less at another readout (noise, strong compression, 60 and 120 frames per second)
 # and 11 leave 1.03 and more
 _AS_WELL = 1.02
 # Of the frame rate, by which the frequency within a frame is changed to find that of a wave; an eighth changes what the
 # wave explains by 1 to 2 %, a quarter by 7 %, a half by 25 %
-_COARSE, _FINE = np.array([-0.375, -0.125, 0.125, 0.375]), np.arange(-4, 5) / 8
+_COARSE, _FINE = np.array([-0.25, 0.25]), np.arange(-4, 5) / 8
 _SAME_PART = 0.005  # between parts, which turns a tone of five periods within a frame by 5 degrees at its ends
 _HARMLESS = 0.05  # difference of a readout that leaves a twentieth of the displacement of the rows
 _SAME_WAVE = 0.02  # periods per frame, between frequencies from frame to frame, from which windows separate them
@@ -46,10 +50,10 @@ class _Wave:
         """Frequency in Hz of the tone that it is if the readout takes this part of the time."""
         return self.frequency + round((self.within / part - self.frequency) * interval) / interval
 
-    def parts(self, interval: float) -> list[float]:
-        """Parts of the time of a readout with which it is one tone."""
+    def parts(self, interval: float, most: float) -> list[float]:
+        """Parts of the time of a readout with which it is one tone, up to ``most``."""
         turns = np.arange(
-            math.ceil((self.within / _MOST_PART - self.frequency) * interval),
+            math.ceil((self.within / most - self.frequency) * interval),
             (self.within / _LEAST_PART - self.frequency) * interval,
         )
         return [float(self.within / alias) for alias in self.frequency + turns / interval if alias > 0]
@@ -90,9 +94,9 @@ def _strongest_wave(fit: WindowFit, axis: int, readout: float) -> _Wave | None:
     return _Wave(axis, frequency, frequency + (part + _FINE[number]) * rate + step * float(np.clip(shift, -1.0, 1.0)))
 
 
-def _waves(fit: WindowFit, readout: float) -> list[_Wave]:
-    """The waves of the rows, one for tones that are aliases of each other."""
-    if not fit.tones:
+def _waves(fit: WindowFit, readout: float, is_explained: bool) -> list[_Wave]:
+    """The waves of the rows, one for tones that are aliases of each other; none without tones if all is explained."""
+    if not fit.tones and is_explained:
         return []
     waves = [wave for axis in (0, 1) if (wave := _strongest_wave(fit, axis, readout)) is not None]
     for tone in fit.tones:
@@ -102,49 +106,84 @@ def _waves(fit: WindowFit, readout: float) -> list[_Wave]:
     return waves
 
 
-def compared_readouts(fit: WindowFit, readout: float) -> WindowPath:
-    """The path of a fit, or that with another readout which has another path, and ``WindowPath.other_readout``.
+@dataclass(frozen=True, eq=False)
+class _Readouts:
+    """Readouts of rows, or of columns, that take other times than the stated one."""
 
-    The stated ``readout`` takes from the first to the last row, in s.
-    """
-    waves, interval = _waves(fit, readout), fit.interval
+    fit: WindowFit  # with the stated time
+    readout: float  # s, the stated time from the first to the last row
+    waves: list[_Wave]
 
-    def with_part(part: float, rounds: int) -> WindowFit:
-        moved = (1.0 - part) * readout * (fit.corners.rows - 0.5)
-        other = WindowFit(replace(fit.corners, times=fit.corners.times - moved[:, None]), interval, fit.averaged)
+    def parts(self) -> list[float]:
+        """Parts of the stated time with which each wave is one tone, but not the same one; -1: rows are in reverse."""
+        interval = self.fit.interval
+        most = max(interval / self.readout, 1.0)  # rows are not read in more time than there is between two frames
+        proposed = sorted(part for wave in self.waves for part in wave.parts(interval, most))
+        others = [
+            part
+            for before, part in pairwise((-1.0, *proposed))
+            if part > (1.0 + _SAME_PART) * before
+            and (
+                abs(part - 1.0) > _HARMLESS
+                or any(wave.alias(part, interval) != wave.alias(1.0, interval) for wave in self.waves)
+            )
+        ]
+        return [-1.0, 0.0, 1.0, *(others if self.waves else _WITHOUT_TONES)]
+
+    def with_part(self, part: float, rounds: int) -> WindowFit:
+        """The fit if rows take a part of the stated time."""
+        fit = self.fit
+        moved = (1.0 - part) * self.readout * (fit.corners.rows - 0.5)
+        other = WindowFit(replace(fit.corners, times=fit.corners.times - moved[:, None]), fit.interval, fit.averaged)
         if part > 0.0:
-            other.add_tones(sorted({(wave.axis, wave.alias(part, interval)) for wave in waves}))
+            other.add_tones(sorted({(wave.axis, wave.alias(part, fit.interval)) for wave in self.waves}))
         other.layer, other.weights = fit.layer, fit.weights
         other.solve(rounds)
         return other
+
+
+def _by_columns(fit: WindowFit, readout: float, timing: SensorTiming, size: tuple[int, int]) -> WindowFit:
+    """The path of the corners of frames (H, W) if columns are read one after another, in the time of all rows."""
+    corners, axis = fit.corners, -1 - int(timing.scan_axis)
+    ends = (corners.places[:, None] + np.array([[-0.5], [0.5]]) * corners.offsets[:, None]) / np.array(size[::-1])
+    rows, columns = ends[..., axis] * (1 if timing.readout_direction == "forward" else -1), ends[..., 1 - axis]
+    times = corners.times + readout * (columns - rows)
+    path = WindowFit(replace(corners, rows=columns[:, 0] + 0.5, times=times), fit.interval, fit.averaged)
+    path.layer, path.weights = fit.layer, fit.layer.astype(np.float64)
+    path.solve(ROUNDS)
+    return path
+
+
+def compared_readouts(fit: WindowFit, timing: SensorTiming, size: tuple[int, int], allowed: float) -> WindowPath:
+    """The path of a fit, or that with another readout which explains the corners, and ``WindowPath.other_readout``.
+
+    The frames are of size (H, W); a fit that leaves more than ``allowed`` in px does not explain the corners.
+    """
 
     def name(part: float) -> str:
         return {-1.0: "in reverse", 0.0: "all at once"}.get(part, f"in {part:.2f} times the time")
 
     def with_its_tones(part: float) -> str:
-        tones = dict.fromkeys(f"{wave.alias(part, interval):.4g}" for wave in waves)
+        tones = dict.fromkeys(f"{wave.alias(part, fit.interval):.4g}" for wave in rows.waves)
         return f"{name(part)}, with tones of {', '.join(tones)} Hz"
 
-    # 1. The readouts with which each wave is one tone, without those at which all tones are as with the stated readout.
-    proposed = sorted(part for wave in waves for part in wave.parts(interval)) if waves else _WITHOUT_TONES
-    parts = [
-        part
-        for before, part in pairwise((-1.0, *proposed))
-        if part > (1.0 + _SAME_PART) * before
-        and (
-            abs(part - 1.0) > _HARMLESS
-            or any(wave.alias(part, interval) != wave.alias(1.0, interval) for wave in waves)
-        )
-    ]
+    # 1. Readouts of the rows, and of the columns, and the waves that they may explain.
+    readout = timing.row_time * size[int(timing.scan_axis)]
+    fits, is_explained = (fit, _by_columns(fit, readout, timing, size)), fit.path().residual < allowed
+    rows, columns = (_Readouts(one, readout, _waves(one, readout, is_explained)) for one in fits)
     # 2. The best of them after one round, from the weights of the stated readout, must leave less in a robust fit. It
     # may do so by waves that have not been found as tones with the stated readout.
-    left = {part: with_part(part, 1).unexplained for part in (-1.0, 0.0, *parts)}
-    part = min(left, key=lambda one: left[one])
-    other = with_part(part, ROUNDS)
-    allowed = other.unexplained * _CONTRADICTED
-    if allowed > fit.unexplained or allowed > with_part(1.0, ROUNDS).unexplained:
-        agreeing = [one for one in parts if waves and left[one] < _AS_WELL * fit.unexplained]
+    left = {(of, part): of.with_part(part, 1).unexplained for of in (rows, columns) for part in of.parts()}
+    of, part = min(left, key=lambda one: left[one])
+    other = of.with_part(part, ROUNDS)
+    least = (_CONTRADICTED if of.waves else _BY_PATH) * other.unexplained
+    if least > fit.unexplained or least > rows.with_part(1.0, ROUNDS).unexplained:
+        most = _AS_WELL * fit.unexplained if fit.tones else 0.0
+        agreeing = [part for (of, part), value in left.items() if of is rows and 0 < part != 1 and value < most]
         return fit.path(agreeing=tuple(map(with_its_tones, sorted(agreeing, key=lambda one: abs(math.log(one))))))
-    found = name(part), math.sqrt(fit.unexplained), math.sqrt(other.unexplained)
-    # Rows that are read the other way, or all at once, are displaced along another path.
-    return (other if part <= 0.0 else fit).path(found, is_of_other=part <= 0.0)
+    # 3. Frames whose columns are read one after another are moved as a whole.
+    most = _CONTRADICTED * left[of, part]
+    alike = sorted((value, one) for (its, one), value in left.items() if its is of is rows and value < most)
+    names = " or ".join([*dict.fromkeys(name(one) for _, one in alike)][:3]) or "column by column"
+    found = names, math.sqrt(fit.unexplained), math.sqrt(other.unexplained)
+    return other.path(found, part=part if of is rows else 0.0)

@@ -94,6 +94,15 @@ class WindowTone:
     frequency_std: float = math.inf  # Hz
     apart: float = 0.0  # largest part of the tone that is left in a third of the rows or columns
 
+    @property
+    def size(self) -> float:
+        """Mean amplitude (rms) in px."""
+        return math.sqrt(np.square(np.abs(self.knots)).mean())
+
+    def bend(self, part: slice = slice(None)) -> float:
+        """What the spline does not follow near some of the knots, in px."""
+        return 0.25 * float(np.abs(np.diff(self.knots[part], 2)).max())
+
     def at(self, time: float, origin: float, weight: float = 1.0) -> Tone:
         """The tone as it is at a time in s, with the time origin of its phase, multiplied by a weight."""
         index, factors = spline_taps(np.array([time]), self.start, self.step, len(self.knots))
@@ -101,7 +110,7 @@ class WindowTone:
         turns = frequency * origin - 0.5 * self.slope * time**2
         turned = (factors * self.knots[index]).sum() * np.exp(2j * math.pi * turns)
         # What a spline does not follow: behind a blow that decays with 0.1 s, amplitudes were wrong by 6 to 20 std.
-        bent = 0.25 * float(np.abs(np.diff(self.knots[index.min() : index.max() + 1], 2)).max())
+        bent = self.bend(slice(index.min(), index.max() + 1))
         bent = math.sqrt(max(bent**2 - 0.375 * min(self.amplitude_std, 1e9) ** 2, 0.0))  # without that of noise
         size_std = math.hypot(self.amplitude_std, bent)
         phase = bent / max(abs(turned), bent, 1e-30)
@@ -176,7 +185,8 @@ class WindowPath:
     # how the rows are read instead, if the corners contradict the stated readout, and px, median residuals by the path
     # with the stated and with this readout
     other_readout: tuple[str, float, float] | None
-    is_of_other: bool  # whether the path is that with this readout, because its rows are displaced along another path
+    # part of the stated time of the readout, by which the path and the tones displace the rows; 0: as columns do
+    part: float
     agreeing: tuple[str, ...]  # other readouts that explain the corners as well, and the frequencies of their tones
 
     def path(self, times: Array, derivative: int = 0) -> Array:
@@ -451,11 +461,10 @@ class WindowFit:
         def is_kept(tone: WindowTone, wave: NDArray[np.complex128]) -> bool:
             least = _NEARLY_BLIND if tone.apart > _MAX_APART else _MIN_GAIN
             is_visible = abs(tone.slope) > _FAST or _gain(tone.frequency, self.interval) > least
-            size = math.sqrt(np.square(np.abs(tone.knots)).mean())
             return bool(
                 is_visible
                 and tone.apart < _MOST_APART
-                and size > SIGNIFICANT * tone.amplitude_std
+                and tone.size > SIGNIFICANT * tone.amplitude_std
                 and 0.5 * np.square(np.abs(wave)).mean() > _MIN_EXPLAINED**2
             )
 
@@ -465,7 +474,7 @@ class WindowFit:
         self,
         other_readout: tuple[str, float, float] | None = None,
         *,
-        is_of_other: bool = False,
+        part: float = 1.0,
         agreeing: tuple[str, ...] = (),
     ) -> WindowPath:
         """The result of the fit; the arguments are those of ``WindowPath``."""
@@ -474,7 +483,7 @@ class WindowFit:
         if not self.layer.all():  # with a subject on 40 % of the frame, tones of 0.1 px were found that are none
             residual_of_most = float(np.quantile(self.distance, 0.8)) / _FOUR_FIFTHS
         of_window, of_fit = (self.origin, self.start, self.step, knots, tuple(self.tones)), (residual, residual_of_most)
-        return WindowPath(*of_window, *of_fit, other_readout, is_of_other, agreeing)
+        return WindowPath(*of_window, *of_fit, other_readout, part, agreeing)
 
     def is_apart_from(self, frequency: float, others: Array) -> NDArray[np.bool_]:
         """Whether other frequencies are not those of a tone, nor of a change of its amplitude."""

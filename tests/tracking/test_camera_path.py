@@ -43,6 +43,7 @@ def recorded(
     count=COUNT,
     zoom=(0.0, 0.0),
     of_hand=1.0,
+    rate=RATE,
 ):
     """(T, H, W) counts: a scene whose left part is nearer, with a subject that walks through, as a hand records it."""
     scene = spline_filter(draw_scene(HEIGHT + 160, WIDTH + 160, 3), order=3)
@@ -54,7 +55,7 @@ def recorded(
     for number in range(count):
         total = np.zeros((HEIGHT, WIDTH))
         for sample in range(samples):
-            t = number / RATE + y * timing.row_time + (sample + 0.5) / samples * timing.exposure_time
+            t = number / rate + y * timing.row_time + (sample + 0.5) / samples * timing.exposure_time
             (dx, dy, roll, size), moved = of_hand * hand(t), vibration(t, tones, decay, sweep)
             size = size + zoom[0] * np.sin(2 * np.pi * zoom[1] * t)
             near = np.where(x < 0.3 * WIDTH, 3.0 * of_hand * np.sin(2 * np.pi * 0.7 * t), 0.0)
@@ -77,7 +78,7 @@ def recorded(
 def fitted(frames, timing=TIMING):
     follower = CornerFollower(timing)
     pairs = [follower.next(frame, number / RATE) for number, frame in enumerate(frames)]
-    return pairs[1:], camera_path(pairs[1:], timing, (HEIGHT, WIDTH))
+    return pairs[1:], camera_path(pairs[1:], timing, frames[0].shape)
 
 
 def test_tones_and_path_of_a_hand_with_parallax_and_a_subject():
@@ -108,8 +109,37 @@ def test_a_hand_without_vibration_has_no_tones_and_shows_the_readout():
     other, stated, with_other = reverse.windows[0].other_readout
     assert other == "in reverse"
     assert with_other < 0.8 * stated
-    assert right.displaces_rows
-    assert not reverse.displaces_rows
+    # rows are displaced as they are read, not as it is stated
+    forward, backward = (path.derivatives(np.array([0.711]), 1)[0, :2] for path in (right, reverse))
+    np.testing.assert_allclose(backward, -forward, atol=5.0)
+    assert np.abs(forward).max() > 30  # px/s
+
+
+@pytest.mark.parametrize("tones", [{}, TONES])
+def test_columns_that_are_read_one_after_another_are_noticed(tones):
+    """A phone held upright: the rows of a clip that was reported as steady moved apart as much as before."""
+    frames = [np.ascontiguousarray(frame.T) for frame in recorded(tones, subject=False)]
+    row_time = TIMING.row_time * HEIGHT / WIDTH
+    timing = SensorTiming(row_time, TIMING.exposure_time / row_time, 1 / RATE / row_time)
+    path = fitted(frames, timing)[1]
+    other, stated, by_columns = path.windows[0].other_readout
+    assert other == "column by column"
+    assert by_columns < (0.3 if tones else 0.9) * stated
+    assert path.tones(0.7) == []  # frames are moved as a whole
+    assert not path.derivatives(np.array([0.7]), 1).any()
+
+
+def test_slow_motion_with_the_frame_rate_of_its_playback_contradicts_the_readout():
+    """120 frames per second, stored as 30: tones of 147 Hz are none from frame to frame by the times of the file."""
+    readout = SensorTiming(row_time=25e-6, exposure_rows=40, frame_rows=1 / 120 / 25e-6)
+    frames = recorded({0: (1.5, 147.0, 0.3), 1: (1.0, 97.0, 1.0)}, subject=False, timing=readout, rate=120.0)
+    timing = replace(readout, frame_rows=1 / RATE / 25e-6)
+    path = fitted(frames, timing)[1]
+    assert path.windows[0].other_readout is not None
+    # with any of the readouts that explain the corners, tones displace the rows as they are displaced
+    frequency = {tone.axis: tone.frequency for tone in path.tones(0.8)}
+    assert frequency[0] == pytest.approx(147.0, abs=15.0)
+    assert frequency[1] == pytest.approx(97.0, abs=15.0)
 
 
 @pytest.mark.parametrize("factor", [0.7, 1.25, 1.5, 2.0])

@@ -232,6 +232,16 @@ def test_frames_that_were_repeated_do_not_have_the_times_of_the_file(frames, tmp
         assert [[one.code for one in of_axis][-1] for of_axis in found.findings] == ["frames_repeated"] * 2
 
 
+def test_tones_of_a_video_whose_frames_are_missing_without_a_gap_in_its_times_are_not_reliable(frames, tmp_path):
+    """Tones of 0.1 to 0.2 px beside the right ones were reliable."""
+    kept = np.delete(np.arange(COUNT), [12, 21, 22, 30])
+    source = write(tmp_path / "clip.mp4", frames[kept])
+    report = process_video(source, tmp_path / "still.mp4", TIMING, **OPTIONS)
+    found = read_manifest(report.manifest).detections()
+    assert not any(bool(one.reliable.any()) for one in found)
+    assert "tone_changes" in {reason.code for one in found for of_axis in one.findings for reason in of_axis}
+
+
 def test_copies_of_frames_are_moved_along_the_smooth_path(tmp_path):
     source = write(tmp_path / "clip.mp4", counts_of(shaken())[np.arange(40) * 24 // 30])
     process_video(source, tmp_path / "steady.mp4", TIMING, border="crop", steady=1 / 3, **OPTIONS)
