@@ -6,6 +6,7 @@ coupling of the scan with motion along it are part of the model, and all tones o
 """
 
 import math
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -16,7 +17,16 @@ from scipy.linalg import block_diag
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
-from rsvib_torch.numerics.tables import Array, cos_sin, select_stacks, split_axis, tensor, unit_wave, without_nan
+from rsvib_torch.numerics.tables import (
+    Array,
+    cos_sin,
+    select_stacks,
+    split_axis,
+    take_stacks,
+    tensor,
+    unit_wave,
+    without_nan,
+)
 
 MIN_GAIN = 0.1  # px of offset per px of displacement; below it, amplitudes are ten times noisier than offsets
 # px, amplitude of tones near blind frequencies, of x, y, roll and zoom. A clip with a blind vibration along y was
@@ -122,19 +132,21 @@ def _jacobian_of_tones(smearing_times: Array, time: Array, tones: Array) -> Arra
     attenuation = smeared[0] * smeared[1]
     slope = (smeared_slope * smearing_times * smeared[::-1]).sum(0)
     # the frequency changes the attenuation and the angle: Re((slope + 2 pi i time attenuation) C exp(i angle))
-    by_attenuation = np.moveaxis((tones[..., :2] * slope[..., None])[:, None, None], -1, 0)
-    by_angle = np.moveaxis((tones[..., :2] * (2 * math.pi * attenuation)[..., None])[:, None, None], -1, 0)
-    angle = (2 * math.pi * frequencies)[:, None, None] * time
-    (cos, sin), attenuation = cos_sin(angle), attenuation[:, None, None]
-    by_frequency = cos * (by_attenuation[0] - time * by_angle[1]) - sin * (by_attenuation[1] + time * by_angle[0])
+    slope, attenuation, frequencies, real, imaginary = (
+        values[:, None, None] for values in (slope, attenuation, frequencies, tones[..., 0], tones[..., 1])
+    )
+    turn = (2 * math.pi) * attenuation
+    angle = (2 * math.pi * frequencies) * time
+    cos, sin = cos_sin(angle)
+    by_frequency = cos * (slope * real - time * (turn * imaginary)) - sin * (slope * imaginary + time * (turn * real))
     by_tones = np.stack([attenuation * cos, -attenuation * sin, by_frequency], -1)
     return by_tones.reshape(*angle.shape[:-1], -1)
 
 
 def _sinc(x: Array) -> tuple[Array, Array]:
-    """sin(pi x) / (pi x) of x >= 0 and its derivative, which is -3e-4 instead of 0 below 1e-4."""
+    """sin(pi x) / (pi x) of x >= 0 and its derivative, which is -5e-4 instead of 0 below 1e-4."""
     value, positive = np.sinc(x), np.maximum(x, 1e-4)
-    return value, (np.cos(math.pi * positive) - np.sinc(positive)) / positive
+    return value, (np.cos(math.pi * positive) - value) / positive
 
 
 @cache
@@ -184,6 +196,14 @@ class _Problem:
         drifts = measurements.drifts[..., :order]
         self.drift_columns = np.broadcast_to(drifts, (*drifts.shape[:3], self.axes, order))
         self.root = measurements.root[:, :, None]  # (B, N, 1, A, A)
+
+    def of_stacks(self, index: Array) -> "_Problem":
+        """The problem of some stacks."""
+        part = copy(self)
+        part.measurements = take_stacks([self.measurements], index)
+        for name in ("active", "free", "linear", "drift_columns", "root"):
+            setattr(part, name, getattr(self, name)[index])
+        return part
 
     def _of_free(self, parameters: Array) -> Array:
         """(B, M) bool, free parameters that change any of the parameters (B, 2, P)."""
@@ -306,24 +326,31 @@ class _Problem:
             values[..., self.is_frequency] = np.where(self.active, start, 0.0)
             state = self.with_best_amplitudes(self.evaluate(values))
         # 2. Damped steps. A step that decreases the cost is taken, and the damping of a stack decreases or increases.
-        damping = np.full_like(state.cost, 1e-3)
-        done = np.zeros_like(state.cost, dtype=bool)
+        # Stacks that are done leave the batch.
+        problem, stacks, damping = self, np.arange(len(state.cost)), np.full_like(state.cost, 1e-3)
+        finished: list[_Estimate] = []
+        order: list[Array] = []
         for _ in range(iterations):
-            step = _step(state, self.free, damping)
-            done = done | ((step * state.right).sum(-1) <= tolerance * state.cost)
+            step = _step(state, problem.free, damping)
+            done = (step * state.right).sum(-1) <= tolerance * state.cost
             if bool(done.all()):
                 break
-            trial = self.evaluate(self.moved(state.values, step))
-            curved = (trial.cost > state.cost) & self.is_lone_and_resolved(trial.values)
+            if bool(done.any()):
+                (ended,), (index,) = done.nonzero(), (~done).nonzero()
+                finished.append(take_stacks([state], ended))
+                order.append(stacks[ended])
+                problem, state = problem.of_stacks(index), take_stacks([state], index)
+                stacks, step, damping = stacks[index], step[index], damping[index]
+            trial = problem.evaluate(problem.moved(state.values, step))
+            curved = (trial.cost > state.cost) & problem.is_lone_and_resolved(trial.values)
             if bool(curved.any()):
                 # valleys of slow tones are curved: the amplitudes that fit the new frequencies follow them, in 5 steps
                 # instead of 24
-                trial = select_stacks(curved, self.with_best_amplitudes(trial), trial)
+                trial = select_stacks(curved, problem.with_best_amplitudes(trial), trial)
             better = trial.cost <= state.cost
-            taken = better & ~done
-            state = trial if bool(taken.all()) else select_stacks(taken, trial, state)
+            state = trial if bool(better.all()) else select_stacks(better, trial, state)
             damping = np.clip(np.where(better, damping * 0.1, damping * 10.0), 1e-12, 1e6)
-        return state
+        return take_stacks([*finished, state], np.concatenate([*order, stacks]).argsort()) if finished else state
 
 
 def _scaled(state: _Estimate, free: Array, damping: Array) -> tuple[Array, Array]:

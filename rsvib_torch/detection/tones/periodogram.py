@@ -6,7 +6,7 @@ import numpy as np
 from scipy import ndimage
 
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.tones.fit import MIN_GAIN, ToneFit, fit_roughly, tone_response
+from rsvib_torch.detection.tones.fit import MIN_GAIN, ToneFit, fit_roughly, residual_of, tone_response
 from rsvib_torch.execution.chunking import runs
 from rsvib_torch.numerics.fourier import fourier_sums
 from rsvib_torch.numerics.tables import Array, quantile, split_axis, take_stacks, without_nan
@@ -164,8 +164,7 @@ def best_candidate(
     parts, weights, peaks = measurements, weighed.weights[:, None], 4  # outliers may raise a wrong peak
     if leave_out:
         kept = without_stretches(measurements)
-        used = np.tile(kept, (len(measurements.exposure_starts), 1))[..., None].astype(np.float64)
-        parts = measurements.repeated(len(kept)).scaled(used)
+        parts = measurements.repeated(len(kept)).scaled(np.tile(kept, (len(weights), 1))[..., None].astype(np.float64))
         weights, peaks = np.concatenate([weights, kept[1:, :, None] * measurements.weights[:, None]], 1), 2
     # 2. The highest peaks of each part, for the two axes, each fitted roughly with the tones of the earlier fit.
     unexplained = replace(measurements, displacements=residual)
@@ -176,7 +175,7 @@ def best_candidate(
     count = len(further) // len(peaks_of_parts)
     earlier = np.repeat(before.frequencies[..., : active.shape[-1] - harmonics], count, 0)
     rough, residuals = fit_roughly(
-        parts.repeated(peaks_of_parts.shape[-1]),
+        parts.thinned().repeated(peaks_of_parts.shape[-1]),
         np.concatenate([earlier, further], -1),
         np.repeat(active, count, 0),
         model,
@@ -184,7 +183,7 @@ def best_candidate(
     )
     # 3. For each axis the fit that explains most, of which 65 % of the rows count: outliers may be all others. A tone
     # that is nearly blind counts less.
-    several = measurements.repeated(count)
+    several = measurements.thinned().repeated(count)
     size = split_axis(without_nan(quantile(several.sizes(residuals), 0.65, 1), 0.0), 0, -1, count)
     visible = split_axis(visibility(several, rough.frequencies[..., -harmonics:]), 0, -1, count)
     best = ((size.max(1, keepdims=True) - size) * visible).argmax(1)  # (B, 2)
@@ -195,8 +194,9 @@ def best_candidate(
         return np.moveaxis(np.take_along_axis(tried, place, 1)[:, 0], 1, axis)
 
     best_tones = {name: chosen(getattr(rough, name), 1) for name in ("coefficients", "frequencies", "drift")}
-    fit = ToneFit(**best_tones, active=active, covariance=rough.covariance[:0], centre=before.centre, model=model)
-    residual = chosen(residuals, 3)
+    centre = rough.centre[::count]
+    fit = ToneFit(**best_tones, active=active, covariance=rough.covariance[:0], centre=centre, model=model)
+    residual = residual_of(measurements, fit)
     # 4. Without a stretch: steps towards the least absolute residuals of all rows.
     for _ in range(3 if leave_out else 0):
         fit, residual = fit_roughly(measurements.for_least_absolute(residual), fit, active, model)

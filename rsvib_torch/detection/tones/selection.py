@@ -71,13 +71,14 @@ def with_best_aliases(
         return fit
     parameters = fit.parameters[0].size
     fit = replace(fit, covariance=np.zeros((len(size), parameters, parameters)))
+    thinned = measurements.thinned()
     steps = np.repeat(np.arange(-_ALIASES, _ALIASES + 1), 2)
     signs = np.tile([1.0, -1.0], len(steps) // 2)
     for axis in np.flatnonzero(wrong.any(0)):
         # 1. The aliases of the tone of this axis, each fitted roughly.
         (index,) = wrong[:, axis].nonzero()
         tried = np.repeat(index, len(steps))
-        some, frequencies = take_stacks([measurements], tried), fit.frequencies[tried]
+        some, frequencies = take_stacks([thinned], tried), fit.frequencies[tried]
         frequencies[:, axis, 0] = np.abs(
             (signs * fit.frequencies[index, axis] + steps / measurements.interval[index, None]).ravel()
         )

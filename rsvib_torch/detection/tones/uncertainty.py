@@ -376,12 +376,11 @@ def _added(
     eye = np.eye(2)
     limit = precision + problem.rounding(axis)[:, None, None, None]
     frequencies, counted = _grid(measurements, fit, axis)
-    parts = []
+    parts, along = [], measurements.of_axis(axis)
     for part in runs(frequencies.shape[1], max(1, _CHUNK // (4 * problem.residual.size))):
         chunk = frequencies[:, part]
         # 2. Posterior of the quadratures v of a tone of each frequency f, and its evidence; sums over measurements d.
-        of_axes = np.repeat(chunk[:, None], fit.coefficients.shape[1], 1)
-        response = tone_response(measurements, of_axes)[..., axis, :]
+        response = tone_response(along, chunk[:, None])[..., 0, :]
         unexplained = problem.unexplained(_quadratures(response).reshape(*response.shape[:-1], -1), axis)
         Z, back = (split_axis(values, -1, -1, 2) for values in unexplained)
         information = np.einsum("bdfp,bdfq->bfpq", Z, Z)
