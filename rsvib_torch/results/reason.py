@@ -237,8 +237,8 @@ _TONES = {
     "rows_unexplained": _px(
         "rows move by {value:.3g} px that no tone explains, {limit:.2g} px are allowed",
         f"{_TONES_OR_FREE}, {_CHECK_TIMING}",
-        "rms residual of the rows without their noise, of all frames or of one group, above 0.05 px and 0.6 % of the "
-        "rms offsets",
+        "rms residual of the rows without their noise, of all frames or of one group, above 0.6 % of the rms offsets, "
+        "at least 0.05 px and at most 0.1 px",
         free_model=True,
     ),
     "neighbours_unexplained": _px(

@@ -4,6 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from benchmarks.honesty_cases import recording
 from scipy import ndimage
 from small_video import write_video
 from truth import Curve, Motion, draw_scene, recorded, take_frames, tone_errors
@@ -385,3 +386,13 @@ def test_rows_without_content_do_not_decide():
     assert found.reliable.all(), found.reasons
     assert largest_error(found, motion) < 4
     assert found.vibration.image_motion.abs().max() < 0.2
+
+
+@pytest.mark.parametrize("number", [46, 86])
+def test_frames_that_are_compared_at_a_wrong_place_are_not_reliable(number):
+    """Streets repeat: offsets of 28 px were taken for 50 px and 140 px, and these axes were reliable."""
+    taken = recording("large amplitude", number, 256)
+    found = detect_vibration(torch.from_numpy(taken.frames).float(), taken.timing)
+    for axis, tones in enumerate(taken.case.tones):
+        amplitude = float(found.vibration.amplitude[axis, 0])
+        assert not bool(found.reliable[axis]) or amplitude == pytest.approx(tones[0, 0], rel=0.02)
