@@ -1,5 +1,6 @@
 """The path and the vibration of a camera over all frames of a video, from overlapping windows of frames."""
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
@@ -80,7 +81,10 @@ def camera_path(
         known = [pair for pair in waiting if pair is not None]
         if len(known) >= max(2, len(waiting) // 4):
             found = fit_window(Corners.joined(known), timing.frame_period, averaged, readout, has_tones)
-            window = compared_readouts(found, timing, size, allowed) if has_tones else found.path()
+            # waves without tones are not searched for again (a third of the time) where no readout explained a window
+            is_tried = any(one.residual > allowed and one.other_readout is None for one in windows)
+            limit = math.inf if is_tried else allowed
+            window = compared_readouts(found, timing, size, limit) if has_tones else found.path()
             windows.extend(swept(window) or [window])
 
     def swept(window: WindowPath) -> list[WindowPath]:
