@@ -26,7 +26,7 @@ from rsvib_torch.checks.validation import (
 )
 
 if TYPE_CHECKING:
-    from rsvib_torch.checks.arrays import ArrayLike
+    from rsvib_torch.checks.arguments import ArrayLike
 
     Mask = ArrayLike | None
     Curve = tuple[ArrayLike | Sequence[float], ArrayLike | Sequence[float]]

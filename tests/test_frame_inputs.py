@@ -11,7 +11,7 @@ import torch
 from refusals import refuses
 
 import rsvib_torch as rsv
-from rsvib_torch.checks.arrays import as_tensor
+from rsvib_torch.checks.arguments import as_tensor
 from rsvib_torch.datasets import city_and_fields
 from rsvib_torch.frames.prepare import prepare_frames
 

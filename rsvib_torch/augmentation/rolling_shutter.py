@@ -15,8 +15,7 @@ from kornia.geometry.keypoints import Keypoints
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.checks.arguments import check_tensor, checks_arguments
-from rsvib_torch.checks.arrays import channels_appear_last
+from rsvib_torch.checks.arguments import channels_appear_last, check_tensor, checks_arguments
 from rsvib_torch.checks.values import check_choice, check_number, check_whole_number
 from rsvib_torch.execution.precision import full_precision
 from rsvib_torch.files.reading import Table

@@ -3,7 +3,7 @@
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
-from rsvib_torch.checks.arrays import FramesOrFiles
+from rsvib_torch.checks.arguments import FramesOrFiles
 from rsvib_torch.checks.values import check_choice
 from rsvib_torch.detection.attempts import FieldOptions, detect_tones
 from rsvib_torch.detection.pipeline import METHODS, DetectionOptions

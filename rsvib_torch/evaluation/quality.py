@@ -7,8 +7,7 @@ from kornia.metrics import ssim as kornia_ssim
 from pydantic import Field
 from torch import Tensor
 
-from rsvib_torch.checks.arguments import checks_arguments
-from rsvib_torch.checks.arrays import FramesLike, as_tensor
+from rsvib_torch.checks.arguments import FramesLike, as_tensor, checks_arguments
 from rsvib_torch.checks.validation import Positive
 
 _Rim = Annotated[int, Field(ge=0)]

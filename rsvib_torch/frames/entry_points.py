@@ -1,24 +1,46 @@
 """Public functions of frames: what they have in common, and types with which editors complete their options.
 
+The argument ``frames`` may be the paths of files; ``io``, a package above this one, reads them.
+
 The options of a function are a group (``options.py``). Its callers pass them as keyword arguments, and the function
 receives ``options``. A decorator has the type of the arguments that precede the options.
 """
 
+import os
 from collections.abc import Callable
 from functools import wraps
-from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
+from typing import Any, Concatenate, NamedTuple, ParamSpec, Protocol, TypeVar, cast
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rsvib_torch.checks.arguments import checks_arguments
-from rsvib_torch.checks.arrays import FramesOrFiles, PathLike
+from rsvib_torch.checks.arguments import FramesLike, FramesOrFiles, PathLike, checks_arguments
 from rsvib_torch.checks.validation import fields_of, flat_options
 from rsvib_torch.execution.precision import outside_graphs
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming, check_timing
+from rsvib_torch.results.higher_packages import IMPORTERS
+
+
+class LoadedFrames(NamedTuple):
+    """Frames in memory, from the argument ``frames`` of a function."""
+
+    frames: FramesLike  # tensor, array or list of these; integers as stored, unless the file has a nodata value
+    full_scale: float | None  # count that corresponds to 1.0; None if it is unknown, and for floats of a file
+    # the timing of the sensor with the frame times of the file; None if the frames were not given by one path
+    timed: Callable[[SensorTiming], SensorTiming] | None
+
+
+def load_frames(frames: FramesOrFiles, full_scale: float | None) -> LoadedFrames:
+    """Read frames that are given by the paths of their files; other frames are returned unchanged."""
+    paths = list(frames) if isinstance(frames, (list, tuple)) else [frames]
+    if not paths or not all(isinstance(path, (str, os.PathLike)) for path in paths):
+        return LoadedFrames(cast(FramesLike, frames), full_scale, None)
+    loaded: LoadedFrames = IMPORTERS["files"]().load_files(paths, full_scale)
+    return loaded if isinstance(frames, (str, os.PathLike)) else loaded._replace(timed=None)  # no common time
+
 
 P = ParamSpec("P")
 Module = TypeVar("Module")

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks.arrays import FramesOrFiles
+from rsvib_torch.checks.arguments import FramesOrFiles
 from rsvib_torch.frames.mosaic import are_mosaics, mosaic_free
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.frames.pixels import cut_columns, detailed_parts

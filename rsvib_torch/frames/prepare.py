@@ -13,10 +13,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks.arguments import check_pixels
-from rsvib_torch.checks.arrays import Channels, FramesLike, FramesOrFiles, as_tensor, channel_axis
+from rsvib_torch.checks.arguments import Channels, FramesLike, FramesOrFiles, as_tensor, channel_axis, check_pixels
 from rsvib_torch.checks.values import beyond_full_scale, check_number
-from rsvib_torch.frames.loading import load_frames
+from rsvib_torch.frames.entry_points import load_frames
 from rsvib_torch.frames.mosaic import check_mosaic, colours_of, fill_by_colour, luminance, mosaic_free
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.frames.pixels import fill_with_means

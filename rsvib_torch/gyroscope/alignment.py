@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks.arrays import FramesOrFiles
+from rsvib_torch.checks.arguments import FramesOrFiles
 from rsvib_torch.checks.values import check_single
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.grouped_frames import grouped_frames

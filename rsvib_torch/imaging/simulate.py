@@ -8,8 +8,7 @@ import math
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks.arguments import check_pixels, checks_arguments
-from rsvib_torch.checks.arrays import ArrayLike, as_tensor, channels_appear_last
+from rsvib_torch.checks.arguments import ArrayLike, as_tensor, channels_appear_last, check_pixels, checks_arguments
 from rsvib_torch.checks.values import check_single
 from rsvib_torch.files.free_memory import check_fits
 from rsvib_torch.frames.column_strips import ColumnStrips

@@ -1,4 +1,4 @@
-"""Stacks in arrays with attributes: a dataset of an HDF5 file, and a Zarr v3 array in a local folder."""
+"""Stacks in arrays: a dataset of an HDF5 file, a Zarr v3 array in a local folder, and NumPy files."""
 
 from __future__ import annotations
 
@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     from zarr.core.metadata import ArrayV3Metadata
 
     Stored: TypeAlias = Dataset | ZarrArray[ArrayV3Metadata]
+from io import BytesIO
+
+from rsvib_torch.io.frame_reader import contiguous_reader
 
 _NAME = "frames"  # of the array that is written
 _MAX_MEMBERS = 10_000  # groups and datasets of HDF5; each takes about 0.1 ms
@@ -194,3 +197,26 @@ def write_zarr(path: Path, info: StackInfo, frames: Iterator[Array], compression
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # other programs read the headers of the arrays, which remain
         _zarr().consolidate_metadata(str(path))
+
+
+def open_npy(path: Path) -> FrameReader:
+    """Open (H, W), (T, H, W) or (T, C, H, W). Pickled objects are refused."""
+    with readable_stack(path, ".npy"):
+        with path.open("rb") as file:
+            head = BytesIO(file.read(1 << 14))  # bytes; NumPy accepts headers of up to 10,000
+        first = np.lib.format.read_magic(head) == (1, 0)
+        read_header = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
+        shape, fortran_order, dtype = read_header(head)
+        info = info_of_array(shape, dtype)
+        if fortran_order:  # the pixels of a frame lie everywhere in the file
+            raise ValueError("the array has Fortran order; store numpy.ascontiguousarray(array)")
+        return contiguous_reader(path, info, head.tell(), dtype)
+
+
+def write_npy(path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None) -> None:
+    """Write a file frame by frame, channels second; arguments as in ``StackFormat.write``."""
+    header = {"descr": np.lib.format.dtype_to_descr(np.dtype(info.dtype)), "fortran_order": False, "shape": info.shape}
+    with path.open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, header)
+        for frame in frames:
+            file.write(np.ascontiguousarray(frame).data)

@@ -11,11 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks.arguments import checks_arguments
-from rsvib_torch.checks.arrays import PathLike
+from rsvib_torch.checks.arguments import PathLike, checks_arguments
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.files.free_memory import check_fits
-from rsvib_torch.frames.loading import LoadedFrames
+from rsvib_torch.frames.entry_points import LoadedFrames
 from rsvib_torch.io.formats import find_format
 from rsvib_torch.io.frame_reader import FrameReader, part_reader
 from rsvib_torch.io.frame_times import timing_from_first_frame

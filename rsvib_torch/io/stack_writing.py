@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from rsvib_torch.checks.arguments import checks_arguments
-from rsvib_torch.checks.arrays import Channels, FramesLike, PathLike, as_tensor, channel_axis
+from rsvib_torch.checks.arguments import Channels, FramesLike, PathLike, as_tensor, channel_axis, checks_arguments
 from rsvib_torch.checks.values import check_choice
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.files.atomic import check_outputs, check_target, check_writable, whole

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image
 
-from rsvib_torch.checks.arrays import channels_appear_last
+from rsvib_torch.checks.arguments import channels_appear_last
 from rsvib_torch.files.reading import Table
 from rsvib_torch.io.full_scale import check_dtype, known_full_scale
 from rsvib_torch.io.stack_info import StackInfo

@@ -7,7 +7,7 @@ import torch
 from scipy import fft, special
 from torch import Tensor
 
-from rsvib_torch.execution.chunking import gathered, runs
+from rsvib_torch.execution.parallel import gathered, runs
 from rsvib_torch.numerics.splines import bspline_coefficient_rows
 from rsvib_torch.numerics.tables import Array, constant
 

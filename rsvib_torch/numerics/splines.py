@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import roots_legendre
 from torch import Tensor
 
-from rsvib_torch.execution.chunking import runs
+from rsvib_torch.execution.parallel import runs
 from rsvib_torch.numerics.tables import Array, table, tensor
 
 

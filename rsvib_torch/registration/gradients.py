@@ -26,8 +26,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.execution.chunking import chunks
-from rsvib_torch.execution.parallel import in_parallel
+from rsvib_torch.execution.parallel import chunks, in_parallel
 from rsvib_torch.numerics.fourier import fast_length
 from rsvib_torch.registration.row_spectra import combined, differences, inner_columns, mean_over_frames
 

@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.execution.chunking import chunks
-from rsvib_torch.execution.parallel import in_parallel
+from rsvib_torch.execution.parallel import chunks, in_parallel
 from rsvib_torch.numerics.fourier import fast_length
 from rsvib_torch.numerics.tables import Array, table, tensor
 

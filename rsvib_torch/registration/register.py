@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.checks.arrays import FramesOrFiles
+from rsvib_torch.checks.arguments import FramesOrFiles
 from rsvib_torch.checks.values import check_choice
-from rsvib_torch.execution.chunking import at_once, chunks, runs
+from rsvib_torch.execution.parallel import at_once, chunks, runs
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.entry_points import frames_options
 from rsvib_torch.frames.orientation import offsets_from_row_order, sequence_from_row_order

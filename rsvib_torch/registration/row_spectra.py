@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.execution.chunking import at_once, chunks, gathered, runs
+from rsvib_torch.execution.parallel import at_once, chunks, gathered, runs
 from rsvib_torch.numerics.fourier import (
     extend_rows,
     fast_length,

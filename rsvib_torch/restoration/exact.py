@@ -15,8 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.execution.chunking import at_once, runs
-from rsvib_torch.execution.parallel import allowed_threads, in_parallel
+from rsvib_torch.execution.parallel import allowed_threads, at_once, in_parallel, runs
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.numerics.fourier import extend_rows
 from rsvib_torch.numerics.tables import table, take_stacks

@@ -15,12 +15,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.checks.arguments import checks_arguments
-from rsvib_torch.checks.arrays import ArrayLike, Channels, FramesOrFiles, as_tensor
+from rsvib_torch.checks.arguments import ArrayLike, Channels, FramesOrFiles, as_tensor, checks_arguments
 from rsvib_torch.checks.values import check_whole_number
-from rsvib_torch.execution.chunking import at_once, runs
+from rsvib_torch.execution.parallel import at_once, runs
 from rsvib_torch.execution.progress import steps
-from rsvib_torch.frames.loading import load_frames
+from rsvib_torch.frames.entry_points import load_frames
 from rsvib_torch.frames.orientation import reasons_from_row_order
 from rsvib_torch.frames.pixels import detailed_parts
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames

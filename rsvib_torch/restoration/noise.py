@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.execution.chunking import at_once, runs
+from rsvib_torch.execution.parallel import at_once, runs
 from rsvib_torch.frames.pixels import cut_parts
 from rsvib_torch.numerics.fourier import squared_modulus
 from rsvib_torch.numerics.tables import Array, constant, median, quantile, table, tables, valid_mean, without_nan

@@ -29,7 +29,7 @@ from numpy.polynomial.chebyshev import chebvander
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.execution.chunking import at_once, runs
+from rsvib_torch.execution.parallel import at_once, runs
 from rsvib_torch.imaging.blur import row_taps, row_transfer
 from rsvib_torch.numerics.banded_solver import from_both_ends
 from rsvib_torch.numerics.fourier import shift_phases, waves

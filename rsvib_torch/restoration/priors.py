@@ -10,8 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.checks.values import check_choice
-from rsvib_torch.execution.chunking import runs
-from rsvib_torch.execution.parallel import in_parallel
+from rsvib_torch.execution.parallel import in_parallel, runs
 from rsvib_torch.restoration.observation import KERNEL_REACH, kernel_samples
 from rsvib_torch.restoration.scene_solver import SceneProblem
 

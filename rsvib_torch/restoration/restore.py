@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks.arrays import ArrayLike, FramesOrFiles
+from rsvib_torch.checks.arguments import ArrayLike, FramesOrFiles
 from rsvib_torch.execution.parallel import threads_for
 from rsvib_torch.execution.precision import full_precision, outside_graphs
 from rsvib_torch.frames.entry_points import TimedModule, module_options, vibration_options

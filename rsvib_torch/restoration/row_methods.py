@@ -12,7 +12,7 @@ from torch.nn.functional import embedding_bag
 
 from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.values import check_single, check_whole_number, described
-from rsvib_torch.execution.chunking import at_once, gathered, runs
+from rsvib_torch.execution.parallel import at_once, gathered, runs
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.imaging.blur import RowPSF, RowVaryingBlur, trajectory_psf

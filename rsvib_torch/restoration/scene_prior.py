@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.execution.chunking import at_once, runs
+from rsvib_torch.execution.parallel import at_once, runs
 from rsvib_torch.numerics.banded_solver import factor_banded
 from rsvib_torch.numerics.fourier import extend_rows, squared_modulus, waves
 from rsvib_torch.numerics.splines import mirrored

@@ -20,8 +20,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from rsvib_torch.execution.chunking import runs
-from rsvib_torch.execution.parallel import in_parallel
+from rsvib_torch.execution.parallel import in_parallel, runs
 from rsvib_torch.numerics.banded_solver import (
     BandedFactor,
     InterpolatedFactors,

@@ -12,7 +12,7 @@ from typing import Literal, ParamSpec, Protocol
 
 from pydantic import Field
 
-from rsvib_torch.checks.arrays import FramesOrFiles
+from rsvib_torch.checks.arguments import FramesOrFiles
 from rsvib_torch.checks.validation import Number, Positive
 from rsvib_torch.checks.validation import options as option_group
 from rsvib_torch.checks.values import check_number

@@ -5,8 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from rsvib_torch.checks.arguments import checks_arguments
-from rsvib_torch.checks.arrays import Channels, FramesOrFiles
+from rsvib_torch.checks.arguments import Channels, FramesOrFiles, checks_arguments
 from rsvib_torch.checks.validation import Positive
 from rsvib_torch.checks.values import check_number
 from rsvib_torch.results.presentation import JudgedResult

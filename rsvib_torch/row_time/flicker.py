@@ -11,8 +11,8 @@ from typing import Literal
 import numpy as np
 from scipy import ndimage
 
-from rsvib_torch.checks.arrays import Channels, FramesOrFiles, channel_axis
-from rsvib_torch.frames.loading import load_frames
+from rsvib_torch.checks.arguments import Channels, FramesOrFiles, channel_axis
+from rsvib_torch.frames.entry_points import load_frames
 from rsvib_torch.frames.prepare import as_float_frames
 from rsvib_torch.numerics.tables import Array
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks.arrays import PathLike
+from rsvib_torch.checks.arguments import PathLike
 from rsvib_torch.checks.values import check_choice
 from rsvib_torch.detection import MotionDetection, detect_motion, detect_vibration
 from rsvib_torch.frames.mosaic import check_mosaic, colour_frames

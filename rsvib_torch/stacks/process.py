@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 import torch
 
-from rsvib_torch.checks.arrays import PathLike
+from rsvib_torch.checks.arguments import PathLike
 from rsvib_torch.execution.parallel import in_threads
 from rsvib_torch.files.atomic import check_outputs, check_writable
 from rsvib_torch.files.reading import Table

@@ -20,8 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks.arguments import as_numbers
-from rsvib_torch.checks.arrays import ArrayLike, as_tensor
+from rsvib_torch.checks.arguments import ArrayLike, as_numbers, as_tensor
 from rsvib_torch.detection.measurements import Measurements, OtherMotion
 from rsvib_torch.detection.pipeline import Attempt, DetectionOptions, Hypothesis, attempt
 from rsvib_torch.detection.rows.displacements import (

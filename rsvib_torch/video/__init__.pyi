@@ -1,8 +1,8 @@
 from .frame_outputs import FrameOutput, PipeOutput, VideoOutput
-from .margins import Margins
 from .process_video import process_video
 from .session import LiveReport, run_live
 from .sources import CameraSource, FileSource, FrameSource, PipeSource, TimedFrame
+from .steadying import Margins
 
 __all__ = [
     "CameraSource",

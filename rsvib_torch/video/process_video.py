@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from rsvib_torch.checks.arrays import PathLike
+from rsvib_torch.checks.arguments import PathLike
 from rsvib_torch.checks.validation import fields_of
 from rsvib_torch.execution.parallel import in_threads
 from rsvib_torch.files.atomic import whole_file

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import conv1d, embedding_bag
 
-from rsvib_torch.execution.chunking import chunks
+from rsvib_torch.execution.parallel import chunks
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.full_scale import counts_to_frames, frames_to_counts
 from rsvib_torch.io.video import Picture

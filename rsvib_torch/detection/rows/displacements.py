@@ -19,7 +19,7 @@ from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements, trimmed_mean
 from rsvib_torch.detection.rows.warping import Positions, differently_blurred, exposure_paths, moments, warp_to_scene
-from rsvib_torch.execution.chunking import chunks, runs
+from rsvib_torch.execution.parallel import chunks, runs
 from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming

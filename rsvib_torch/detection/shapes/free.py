@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.checks.arrays import FramesOrFiles
+from rsvib_torch.checks.arguments import FramesOrFiles
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
 from rsvib_torch.detection.rows.grouped_frames import (

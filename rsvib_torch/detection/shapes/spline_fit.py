@@ -16,7 +16,7 @@ from scipy import linalg, sparse
 from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.execution.chunking import runs
+from rsvib_torch.execution.parallel import runs
 from rsvib_torch.numerics.splines import gauss_legendre, spline_taps
 from rsvib_torch.numerics.tables import Array, table, tensor
 

@@ -46,7 +46,7 @@ from rsvib_torch.detection.tones.fit import (
     tone_response,
     vibration_of_fit,
 )
-from rsvib_torch.execution.chunking import runs
+from rsvib_torch.execution.parallel import runs
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.numerics.tables import Array, pseudo_inverse, split_axis, tensor, unit_wave, valid_mean, without_nan
 

@@ -7,8 +7,7 @@ import torch
 from scipy.optimize import brentq
 from torch import Tensor
 
-from rsvib_torch.checks.arguments import checks_arguments
-from rsvib_torch.checks.arrays import ArrayLike, as_tensor
+from rsvib_torch.checks.arguments import ArrayLike, as_tensor, checks_arguments
 from rsvib_torch.checks.values import check_number
 from rsvib_torch.evaluation.mtf.edge import check_edge, check_roi, fit_edge, straighten
 from rsvib_torch.evaluation.mtf.spread import Tail, fit_spread
