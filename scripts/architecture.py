@@ -51,7 +51,6 @@ INNER_LAYERS: dict[str, tuple[set[str], ...]] = {
         {"assemble", "convergence"},
         {"refinement"},
         {"pipeline"},
-        {"diagnosis"},
         {"attempts"},
         {"shapes"},
         {"detect"},
