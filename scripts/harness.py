@@ -62,7 +62,7 @@ def add_options(parser: argparse.ArgumentParser, options: OptionTable) -> None:
         parser.add_argument(
             "--" + name.replace("_", "-"),
             default=default,
-            help=f"{text} (default: {default})",
+            help=f"{text} (default: %(default)s)",
             type=type(default[0] if several else default),
             choices=choices[0] if choices else None,
             nargs="*" if several else None,

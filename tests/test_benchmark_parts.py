@@ -5,6 +5,7 @@ import math
 from pathlib import Path
 
 import benchmark
+import pytest
 import torch
 from harness import read_result, write_result
 
@@ -32,6 +33,13 @@ def test_results_are_stored_and_read_back(tmp_path):
 def test_the_pages_of_the_documentation_are_up_to_date():
     for path, text in benchmark.pages().items():
         assert path.read_text(encoding="utf-8") == text
+
+
+def test_the_options_of_all_sections_have_a_help(capsys):
+    with pytest.raises(SystemExit) as ended:  # names of kinds contain per cent signs
+        benchmark.parsed(["--only", *benchmark.SECTIONS, "--help"])
+    assert ended.value.code == 0
+    assert "--bar-kinds" in capsys.readouterr().out
 
 
 def test_one_command_writes_markdown_and_json(tmp_path, capsys):
