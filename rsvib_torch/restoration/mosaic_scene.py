@@ -148,7 +148,8 @@ def restore_mosaic(given: MovingFrames, colours: Tensor, options: ExactOptions) 
         if options.noise == "auto":  # of colours whose noise was halved by interpolation
             level = 2 * noise_levels(linear.detach()[None], motion.of([stack])).square().mean().sqrt()
         else:
-            level = torch.as_tensor(max(options.noise, MIN_LEVEL), dtype=frames.dtype, device=frames.device)
+            level = torch.as_tensor(options.noise, dtype=frames.dtype, device=frames.device)
+        level = level.clamp(min=MIN_LEVEL)
         for members, reference in groups:
             # 4. Colours are interpolated first if the frames of a scene do not determine them; this halves their noise.
             part = (linear[members], measured[members], None if floor is None else floor[members], level)
@@ -257,7 +258,7 @@ def _residual_level(solver: MosaicSolver, residual: Tensor, measured: Tensor) ->
     coefficients = solver.fit(noise, iterations=8)
     left = noise - solver.predict(coefficients)
     level = ((residual * measured).square().sum() / (noise * left).sum().clamp(min=1.0)).sqrt()
-    return level, solver.image(coefficients).square().mean().sqrt()
+    return level.clamp(min=MIN_LEVEL), solver.image(coefficients).square().mean().sqrt()
 
 
 _PATCH = 4  # px; 3 px: -0.6 to -1.2 dB, 5 px: -0.3 to +0.1 dB in three times the time
