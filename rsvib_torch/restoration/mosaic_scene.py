@@ -8,7 +8,6 @@ from itertools import product
 import torch
 from torch import Tensor
 from torch.nn import functional
-from torch.nn.functional import pad, pixel_shuffle, pixel_unshuffle
 
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.mosaic import interpolated_colours, measures
@@ -190,7 +189,7 @@ def _scene(
     data = extend_rows(images - mean, length)
     inside = measured_values(along[None], None, data[None].shape, width, ends=True)[0]
     nowhere = ~known.any(1, keepdim=True)
-    measured, filled = (pad(mask, (0, length - width)) & inside for mask in (known, nowhere))
+    measured, filled = (functional.pad(mask, (0, length - width)) & inside for mask in (known, nowhere))
     full = images.detach()
 
     def solver(strength: float) -> MosaicSolver:
@@ -231,9 +230,9 @@ def _scene(
     if gain is None:
         return scene
     # 3. Remove the noise that is left; the points of each pixel are four images, one at a time: less memory.
-    points = pixel_unshuffle(scene, scale).unflatten(0, (3, -1)).movedim(1, 0).split(1)
+    points = functional.pixel_unshuffle(scene, scale).unflatten(0, (3, -1)).movedim(1, 0).split(1)
     points = [similar_patches(part, part, None, gain * level, rounds=2, steps=2) for part in points]
-    return pixel_shuffle(torch.cat(points).movedim(0, 1).flatten(0, 1), scale)
+    return functional.pixel_shuffle(torch.cat(points).movedim(0, 1).flatten(0, 1), scale)
 
 
 def _same_colours(displacement: Tensor, node_weights: Tensor) -> bool:
