@@ -9,13 +9,14 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from functools import partial
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from rsvib_torch.checks.values import Value, needed_package
-from rsvib_torch.io.frame_reader import FrameReader, readable_stack
+from rsvib_torch.io.frame_reader import FrameReader, contiguous_reader, readable_stack
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.io.stated_metadata import attributes_of, info_of_array
 from rsvib_torch.numerics.tables import Array
@@ -26,9 +27,6 @@ if TYPE_CHECKING:
     from zarr.core.metadata import ArrayV3Metadata
 
     Stored: TypeAlias = Dataset | ZarrArray[ArrayV3Metadata]
-from io import BytesIO
-
-from rsvib_torch.io.frame_reader import contiguous_reader
 
 _NAME = "frames"  # of the array that is written
 _MAX_MEMBERS = 10_000  # groups and datasets of HDF5; each takes about 0.1 ms

@@ -226,7 +226,7 @@ class FrameModel(MovingFrames):
 
 
 def model_frames(given: MovingFrames, *, noise: float | Literal["auto"] = "auto", scale: int = 1) -> FrameModel:
-    """Noise levels, period and prior of frames; arguments as in ``restore_exact``."""
+    """Noise levels, period and prior of frames; ``noise`` and ``scale`` are those of ``restore``."""
     frames, motion, strips, ignore, clipped = given.images, given.motion, given.strips, given.ignore, given.clipped
     B, T, _, _, W = frames.shape
     unknown = ignore if clipped is None else clipped if ignore is None else ignore | clipped

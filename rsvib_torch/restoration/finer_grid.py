@@ -9,7 +9,6 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from math import pi
 
 import torch
 from torch import Tensor
@@ -34,7 +33,7 @@ _LEAST_PIXEL, _RISE, _RISE_POWER = 0.005, 10.0, 4
 
 def _laplacian(frequencies: Tensor) -> Tensor:
     """Discrete Laplacian on the grid, at frequencies in cycles per px."""
-    return 2 - 2 * torch.cos(2 * pi / SCALE * frequencies)
+    return 2 - 2 * torch.cos(2 * math.pi / SCALE * frequencies)
 
 
 def _pixel(u: Tensor) -> Tensor:
@@ -163,6 +162,12 @@ class FrameDifference:
         return self.effect > math.hypot(effect, self.expected) or self.residual > math.hypot(residual, self.expected)
 
 
+def _inner(size: int) -> slice:
+    """Rows or columns without those at the ends."""
+    rim = min(16, size // 4)
+    return slice(rim, size - rim)
+
+
 @torch.no_grad()
 def _difference(problem: SceneProblem, predicted: Tensor, width: int, neglected: float) -> FrameDifference:
     """Differences of the data of one scene from a prediction (M, C, R, L), without the ends of rows and columns.
@@ -173,7 +178,7 @@ def _difference(problem: SceneProblem, predicted: Tensor, width: int, neglected:
     # 1. The residual and the gradients of the prediction, by the noise of each row, in blocks of rows.
     data, level = problem.data[0], problem.level[0]
     weight, rows = problem.observation.kernels.weight, data.shape[-2]
-    inner = slice(min(16, rows // 4), -min(16, rows // 4)), slice(min(16, width // 4), width - min(16, width // 4))
+    inner = _inner(rows), _inner(width)
     residual = data - predicted
     gradients = [0.5 * (predicted.roll(-1, axis) - predicted.roll(1, axis)) for axis in (-1, -2)]
     scale = (weight / weight[:, inner[0]].mean()).sqrt()[:, None, :, None]
@@ -200,7 +205,7 @@ def _difference(problem: SceneProblem, predicted: Tensor, width: int, neglected:
 def _excess(problem: SceneProblem, predicted: Tensor, width: int) -> Tensor:
     """Power (U,) of the tapered residual at each horizontal frequency, in units of the noise power."""
     weight, rows = problem.observation.kernels.weight, predicted.shape[-2]
-    inner = slice(min(16, rows // 4), -min(16, rows // 4))
+    inner = _inner(rows)
     taper = torch.hann_window(width + 2, periodic=False, dtype=predicted.dtype, device=predicted.device)[1:-1]
     residual = (problem.data[0] - predicted)[..., inner, :width] * (taper / taper.square().sum().sqrt())
     power = squared_modulus(torch.fft.rfft(residual, n=predicted.shape[-1])).mean(1)

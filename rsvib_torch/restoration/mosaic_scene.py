@@ -8,7 +8,6 @@ from itertools import product
 import torch
 from torch import Tensor
 from torch.nn import functional
-from torch.nn.functional import pad, pixel_shuffle, pixel_unshuffle
 
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.mosaic import interpolated_colours, measures
@@ -148,7 +147,8 @@ def restore_mosaic(given: MovingFrames, colours: Tensor, options: ExactOptions) 
         if options.noise == "auto":  # of colours whose noise was halved by interpolation
             level = 2 * noise_levels(linear.detach()[None], motion.of([stack])).square().mean().sqrt()
         else:
-            level = torch.as_tensor(max(options.noise, MIN_LEVEL), dtype=frames.dtype, device=frames.device)
+            level = torch.as_tensor(options.noise, dtype=frames.dtype, device=frames.device)
+        level = level.clamp(min=MIN_LEVEL)
         for members, reference in groups:
             # 4. Colours are interpolated first if the frames of a scene do not determine them; this halves their noise.
             part = (linear[members], measured[members], None if floor is None else floor[members], level)
@@ -189,7 +189,7 @@ def _scene(
     data = extend_rows(images - mean, length)
     inside = measured_values(along[None], None, data[None].shape, width, ends=True)[0]
     nowhere = ~known.any(1, keepdim=True)
-    measured, filled = (pad(mask, (0, length - width)) & inside for mask in (known, nowhere))
+    measured, filled = (functional.pad(mask, (0, length - width)) & inside for mask in (known, nowhere))
     full = images.detach()
 
     def solver(strength: float) -> MosaicSolver:
@@ -230,9 +230,9 @@ def _scene(
     if gain is None:
         return scene
     # 3. Remove the noise that is left; the points of each pixel are four images, one at a time: less memory.
-    points = pixel_unshuffle(scene, scale).unflatten(0, (3, -1)).movedim(1, 0).split(1)
+    points = functional.pixel_unshuffle(scene, scale).unflatten(0, (3, -1)).movedim(1, 0).split(1)
     points = [similar_patches(part, part, None, gain * level, rounds=2, steps=2) for part in points]
-    return pixel_shuffle(torch.cat(points).movedim(0, 1).flatten(0, 1), scale)
+    return functional.pixel_shuffle(torch.cat(points).movedim(0, 1).flatten(0, 1), scale)
 
 
 def _same_colours(displacement: Tensor, node_weights: Tensor) -> bool:
@@ -257,7 +257,7 @@ def _residual_level(solver: MosaicSolver, residual: Tensor, measured: Tensor) ->
     coefficients = solver.fit(noise, iterations=8)
     left = noise - solver.predict(coefficients)
     level = ((residual * measured).square().sum() / (noise * left).sum().clamp(min=1.0)).sqrt()
-    return level, solver.image(coefficients).square().mean().sqrt()
+    return level.clamp(min=MIN_LEVEL), solver.image(coefficients).square().mean().sqrt()
 
 
 _PATCH = 4  # px; 3 px: -0.6 to -1.2 dB, 5 px: -0.3 to +0.1 dB in three times the time

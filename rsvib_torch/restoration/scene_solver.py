@@ -36,16 +36,19 @@ MOST_THREADS = 2  # that solve systems side by side; more wait for each other's 
 MIN_LEVEL = 1e-5  # of full scale, lowest noise level assumed; below, the systems lose digits in single precision
 
 
-def row_windows(rows: int, count: int, overlap: int = 96) -> list[slice]:
-    """Windows of one size that cover all rows, neighbours overlapping by at least twice ``overlap`` rows.
+_OVERLAP = 192  # rows of neighbouring windows; the solution changes by about 1e-5 unless the exposure blurs
 
-    The dependence of a solution on distant rows decreases exponentially: windows are solved side by side, and the rows
-    of the overlap are discarded. With 96 rows the solution changes by about 1e-5 unless the exposure blurs.
+
+def row_windows(rows: int, count: int) -> list[slice]:
+    """Windows of one size that cover all rows, whose neighbours overlap.
+
+    The dependence of a solution on distant rows decreases exponentially: windows are solved side by side, and joined in
+    the middle of their overlaps.
     """
-    size = -(-(rows + 2 * overlap * (count - 1)) // count)
+    size = -(-(rows + _OVERLAP * (count - 1)) // count)
     if count <= 1 or size >= rows:
         return [slice(0, rows)]
-    starts = [min(k * (size - 2 * overlap), rows - size) for k in range(count)]
+    starts = [min(k * (size - _OVERLAP), rows - size) for k in range(count)]
     return [slice(start, start + size) for start in starts]
 
 

@@ -26,12 +26,7 @@ from rsvib_torch.options import RestorationOptions
 from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError
 from rsvib_torch.restoration.frame_motion import vibration_to_undo
 from rsvib_torch.restoration.judge import judge_prepared
-from rsvib_torch.restoration.restore import (
-    check_optics,
-    restore_prepared,
-    unchanged_frames,
-    warn_of_mosaic,
-)
+from rsvib_torch.restoration.restore import check_optics, restore_prepared, unchanged_frames, warn_of_mosaic
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
 
@@ -174,7 +169,7 @@ def equivalent_tones(found: MotionDetection) -> DetectedVibration:
         image_acceleration=unknown[:, 0],
         displacement=displacement,
     )
-    interval = (last - first) / max(len(found.times) - 1, 1)
+    interval = float(found.times[:, 0].diff().mean())
     return DetectedVibration(
         vibration, std, vibration.gain(interval), found.unexplained, found.reliable, found.findings, assumptions=()
     )

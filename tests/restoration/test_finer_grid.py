@@ -145,6 +145,11 @@ def test_gradients(frames):
     check_gradient(energy, images, rel=0.02)
 
 
+@pytest.mark.parametrize("rows", [1, 3])
+def test_frames_of_few_rows(frames, rows):
+    assert restored(frames[:, :rows], rsv.Vibration(0.8, 90.0)).isfinite().all()
+
+
 def test_frames_that_sample_the_same_points_are_reported(scene, truth):
     still = frames_of(scene, 3, Shake(0 * SHAKE.amplitude, SHAKE.frequency, SHAKE.phase, SHAKE.image_motion))
     with pytest.warns(rsv.RestorationWarning, match="sample the same points"):

@@ -195,6 +195,11 @@ def test_frames_that_do_not_fit_are_reported(frames):
     without_warning(restored, part, noise=NOISE)
 
 
+@pytest.mark.parametrize("joint", [False, True])
+def test_frames_without_detail_keep_their_brightness(joint):
+    torch.testing.assert_close(restored(torch.full((2, 32, 32), 0.5), joint=joint).mean(), torch.tensor(0.5))
+
+
 def test_still_stacks_in_windows(tmp_path):
     """Nothing moves: the middle frame is interpolated."""
     frames = raw(coloured(colour_scene(96), 1, 96)).clamp(0, 1)

@@ -63,6 +63,7 @@ def test_windows_state_equivalent_tones_and_their_motion(place):
     np.testing.assert_allclose(table["frequency_Hz"], np.tile(FREQUENCY, windows), atol=1.0)
     rows = (np.arange(128) + 0.5 * TIMING.exposure_rows) * TIMING.row_time
     for record, motion in zip(manifest.windows, manifest.detections(), strict=True):
+        torch.testing.assert_close(record.detection.gain, record.detection.vibration.gain(TIMING.frame_period))
         times = np.arange(record.last - record.first + 1)[:, None] * TIMING.frame_period + rows
         error = motion.displacement(torch.from_numpy(times)).numpy() - decaying(times + record.start_time)
         assert np.std(error - error.mean(0)) < 0.02  # of what differs between frames

@@ -291,7 +291,7 @@ def _moved(measured: Measurements, motion: Motion) -> Array:
     return table(torch.stack(at_nodes, -1) @ shares)
 
 
-def _bands_reasons(start: BandStart, columns: int, motion: Motion, axes: int = 2) -> list[list[Reason]]:
+def _bands_reasons(start: BandStart, columns: int, motion: Motion, axes: int) -> list[list[Reason]]:
     """Reasons against a motion of each axis in row order that the row bands of one stack of ``columns`` px contradict.
 
     Noise without a scene has offsets of any size, and rows that are measured around a fit to them confirm it.

@@ -48,22 +48,18 @@ class SplineFit:
         several = seen.sum(-1) > 1
         seen, times = seen[several], measured.exposure_starts[0][several] + 0.5 * measured.exposure_time
         first = np.where(seen > 0, times, np.inf).min(1, keepdims=True)
-        index, weights = spline_taps(
-            np.where(seen > 0, times, first), self.start, self.spacing, self.coefficients.shape[-1]
-        )
+        times, count = np.where(seen > 0, times, first), self.coefficients.shape[-1]
+        index, weights = spline_taps(times, self.start, self.spacing, count)
         sums = np.zeros((2, len(self.coefficients)))
         for part in runs(len(seen), 256):  # (256, G, 4 G, 4 G) at a time
             frames = seen[part].shape[1]
-            of_frames = (np.eye(frames)[:, :, None] * weights[part, None]).reshape(
-                -1, frames, 4 * frames
-            )  # (n, G, 4 G)
+            of_frames = np.eye(frames)[:, :, None] * weights[part, None]  # (n, G, G, 4)
+            of_frames = of_frames.reshape(-1, frames, 4 * frames)
             share = seen[part] / seen[part].sum(1, keepdims=True)
             mean = (share[:, :, None] * of_frames).sum(1, keepdims=True)
             indices = index[part].reshape(-1, 4 * frames)
-            of_visible = self._variances(indices, of_frames - mean)
-            sums += np.stack(
-                [(of_visible * seen[part, :, None]).sum((0, 1)), self._variances(indices, mean).sum((0, 1))]
-            )
+            of_visible = self._variances(indices, of_frames - mean) * seen[part, :, None]
+            sums += np.stack([values.sum((0, 1)) for values in (of_visible, self._variances(indices, mean))])
         return np.sqrt(sums[0] / seen.sum()), np.sqrt(sums[1] / len(seen))
 
     def _variances(self, index: Array, weights: Array) -> Array:
