@@ -43,6 +43,7 @@ from rsvib_torch.stacks.window_restoration import (
     may_change,
     reliable_motion,
     restore_trusted,
+    with_known_size,
     without_data,
 )
 from rsvib_torch.stacks.windows import Window, WindowRecord, cut_windows, window_timing
@@ -188,6 +189,7 @@ class StackJob:
         with suppress(ValueError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
             rows = taken.shape[int(timing.scan_axis)]
             found = detect_motion(taken, timing, knot_rows=min(24, max(4, rows // _KNOTS)))
+            found = with_known_size(found, detected)
             if found.reliable.sum() > detected.reliable.sum():
                 return found
         return detected

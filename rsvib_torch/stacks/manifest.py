@@ -150,7 +150,7 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
                     measured_text(tone[quantity], tone[f"{quantity}_spread"] or None) if tone["windows"] else ""
                     for quantity in ("amplitude", "frequency")
                 ]
-                if self._changing and tone["windows"]:
+                if self._changing and tone["windows"] > 1:
                     texts[0] = f"{tone['first']:.4g} … {tone['last']:.4g}"
                 rows.append([name, f"{tone['windows']} of {count}", *texts])
         return ["axis", "reliable windows", "amplitude (px)", "frequency (Hz)"], rows
@@ -164,7 +164,7 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
         vibration = [text_table(*self.tone_table()), spread]
         if changing:
             which = "all" if changing == len(self.windows) else f"{changing} of {len(self.windows)}"
-            text = f"the vibration changes within {which} windows, whose motion was therefore measured without tones"
+            text = f"no steady tones explain {which} windows, whose motion was therefore measured without tones"
             vibration.append(wrapped(f"{text}; amplitudes are those of a tone of the same rms displacement"))
         if self.gyroscope is not None:
             found = self.gyroscope

@@ -332,7 +332,9 @@ def run_to_file(
         complete = read_manifest(path)
         difference = _difference({name: getattr(complete, name) for name in header}, header)
         if difference:
-            raise ValueError(f"{sink}: cannot resume: {difference}; omit resume to replace the output")
+            raise ValueError(
+                f"{sink}: cannot resume: {difference}; resume with the settings of before, or write another output"
+            )
         for written in (sink, path):
             atomic.remove_abandoned(written)
         return report(complete, len(complete.windows))

@@ -5,7 +5,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 
 import math
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from rsvib_torch.checks.values import MAX_NUMBER, beyond_full_scale
 from rsvib_torch.detection import MotionDetection
+from rsvib_torch.detection.verdict import MAX_DISPLACEMENT_STD
 from rsvib_torch.frames.grey import constant_frame
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.imaging.sensor_model import sharpened
@@ -124,10 +125,34 @@ _CHANGES = {"displacement_ambiguous", "rows_unexplained", "neighbours_unexplaine
 
 
 def may_change(detection: DetectedVibration, num_frames: int) -> bool:
-    """Whether tones that change within the frames may be why an axis of a steady vibration is not reliable."""
-    return num_frames >= _LEAST_FRAMES and any(
-        not _CHANGES.isdisjoint(one.code for one in of_axis) for of_axis in detection.findings
-    )
+    """Whether tones that change within the frames may be why an axis of a steady vibration is not reliable.
+
+    They are not if the frames agree with another timing: a motion of any shape explains them with a wrong one as well.
+    """
+    codes = {one.code for of_axis in detection.findings for one in of_axis}
+    is_other_timing = any(code.startswith("other_") for code in codes)
+    return num_frames >= _LEAST_FRAMES and not is_other_timing and not _CHANGES.isdisjoint(codes)
+
+
+_NEARLY_BLIND = 0.5  # offset gain; of the sweeps and decays below, 0.06 to 0.18, of others 1.6 and more
+
+
+def with_known_size(found: MotionDetection, detected: DetectedVibration) -> MotionDetection:
+    """A motion whose axes are refused if most of it is common to all frames, so that its size is not known.
+
+    That is so if the steady tone that was ``detected`` has a small gain, and the standard deviation is more than a
+    quarter of the displacement. Vibrations that sweep or decay near the frame rate were wrong by 7 standard deviations,
+    1.7 px, with standard deviations of 0.4 to 0.5 of the displacement.
+    """
+    tones, findings, reliable = equivalent_tones(found), list(found.findings), found.reliable.clone()
+    for axis in range(len(findings)):
+        size, std = (float(of.amplitude[axis, 0]) / math.sqrt(2) for of in (tones.vibration, tones.std))
+        allowed, gain = MAX_DISPLACEMENT_STD * size, float(detected.gain[axis, 0].abs())
+        is_blind = gain < _NEARLY_BLIND and float(detected.vibration.amplitude[axis, 0]) > 0
+        if bool(reliable[axis]) and is_blind and std > allowed:
+            reliable[axis] = False
+            findings[axis] = (Reason("displacement_uncertain", AXIS_NAMES[axis], std, allowed, {"size": size}),)
+    return replace(found, reliable=reliable, findings=tuple(findings))
 
 
 _SAMPLES = 4096  # of a motion in its record, for the spectrum: 500 per frame of a window of 8
