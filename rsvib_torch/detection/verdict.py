@@ -224,8 +224,8 @@ def residual_reasons(axis: str, numbers: Table) -> list[Reason]:
     """Reasons from motion of rows in px that no vibration explains; limits exceed errors of interpolation and blur."""
     if numbers["unexplained"] > numbers["permitted"]:
         return [Reason("rows_unexplained", axis, numbers["unexplained"], numbers["permitted"])]
-    # px. With 0.015 px and 0.6 %, 7 of 387 recordings have one more right axis (11 of 190 axes with an image motion, a
-    # strong blur or flicker), and two axes are wrong: by a tone of 1.4 px at a blind frequency, and by an acceleration
+    # px. With 0.015 px and 0.6 %, 7 more axes of 216 recordings are right (11 of 190 with an image motion, a strong
+    # blur or flicker), and two are wrong: by a tone of 1.4 px at a blind frequency, and by an acceleration of the image
     allowed = max(0.01, 0.0025 * numbers["size"])
     if numbers["correlated"] > allowed:
         return [Reason("neighbours_unexplained", axis, numbers["correlated"], allowed)]
