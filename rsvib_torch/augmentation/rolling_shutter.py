@@ -19,15 +19,14 @@ from rsvib_torch.checks.arguments import channels_appear_last, check_tensor, che
 from rsvib_torch.checks.values import check_choice, check_number, check_whole_number
 from rsvib_torch.execution.precision import full_precision
 from rsvib_torch.files.reading import Table
-from rsvib_torch.frames.column_strips import ColumnStrips
-from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
+from rsvib_torch.frames.prepare import frames_from_row_order, frames_to_row_order
 from rsvib_torch.imaging import blur_rows, gauss_node_count, trajectory_psf
 from rsvib_torch.imaging.blur import Interpolation
-from rsvib_torch.motion.field import ColumnMotion, displacement_at, largest_in_frame
-from rsvib_torch.motion.motion import Motion
+from rsvib_torch.motion.camera import displacement_at, largest_in_frame
+from rsvib_torch.motion.motion import ColumnMotion, ColumnStrips, Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming, check_timing
 from rsvib_torch.motion.vibration import Vibration
-from rsvib_torch.numerics.splines import gauss_legendre, mirrored
+from rsvib_torch.numerics.interpolation import gauss_legendre, mirrored
 from rsvib_torch.text import quoted
 
 Range = float | Sequence[float] | Sequence[Sequence[float]]

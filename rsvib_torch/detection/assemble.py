@@ -17,7 +17,7 @@ from rsvib_torch.detection.sensitivity import assumptions, timing_sensitivity, w
 from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.detection.tones.fit import ToneFit, model_displacements, motion_of_fit
 from rsvib_torch.detection.verdict import Findings, contradicted_axes
-from rsvib_torch.frames.orientation import (
+from rsvib_torch.frames.prepare import (
     findings_from_row_order,
     magnitudes_from_row_order,
     offsets_from_row_order,

@@ -31,7 +31,7 @@ from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.detection.tones.fit import MotionModel, tone_displacements
 from rsvib_torch.detection.tones.selection import MIN_SIGNIFICANCE, find_tones, robust_fit, typical_size
 from rsvib_torch.detection.verdict import contradicted_axes, halves_move_apart, rotation_possible
-from rsvib_torch.frames.grey import GreyFrames
+from rsvib_torch.frames.prepare import GreyFrames
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.numerics.tables import Array, split_axis, table, take_stacks

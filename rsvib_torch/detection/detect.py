@@ -13,7 +13,7 @@ from rsvib_torch.detection.tones.fit import MotionModel
 from rsvib_torch.execution.parallel import threads_for
 from rsvib_torch.execution.precision import full_precision, without_gradients
 from rsvib_torch.frames.entry_points import TimedModule, frames_options, module_options
-from rsvib_torch.frames.grey import grey_frames
+from rsvib_torch.frames.prepare import grey_frames
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import VibrationOptions
 

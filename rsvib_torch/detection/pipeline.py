@@ -41,7 +41,7 @@ from rsvib_torch.detection.tones.uncertainty import (
     without_aliasing,
 )
 from rsvib_torch.detection.verdict import Findings, compared_bands, judged, scene_reasons, with_reasons_of_all
-from rsvib_torch.frames.grey import GreyFrames
+from rsvib_torch.frames.prepare import GreyFrames
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd, blind_frequencies
 from rsvib_torch.numerics.tables import Array, table, tables, take_stacks

@@ -18,7 +18,7 @@ from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.tones.fit import MotionModel, ToneFit, fit_roughly, motion_of_fit
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
-from rsvib_torch.numerics.fourier import fourier_sums
+from rsvib_torch.numerics.interpolation import fourier_sums
 from rsvib_torch.numerics.tables import Array, table, tensor, unit_wave
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.results.presentation import AXIS_NAMES, Result, check_pixel_size, plain_values

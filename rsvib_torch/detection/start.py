@@ -13,9 +13,9 @@ from torch.nn import functional
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.strips import FieldScale, combined_strips
 from rsvib_torch.detection.tones.fit import ToneFit, model_displacements, with_axes
-from rsvib_torch.frames.column_strips import ColumnStrips
-from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.frames.pixels import cut_columns, detailed_parts
+from rsvib_torch.frames.prepare import GreyFrames
+from rsvib_torch.motion.motion import ColumnStrips
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.numerics.tables import Array, split_axis, table, tables
 from rsvib_torch.options import RegistrationOptions

@@ -1,6 +1,6 @@
 """Components of a motion with roll and zoom, from the displacements of strips of columns.
 
-Roll and zoom displace the content of a row by amounts that depend on the column (``motion.field``). For a start,
+Roll and zoom displace the content of a row by amounts that depend on the column (``displacement_at``). For a start,
 strips of columns are registered like stacks of their own. With the displacement ``d_s`` of a row in strip s, its
 information ``W_s`` and the factors ``F_s`` from the components q of the motion to the displacement at the strip, the
 components of the row are the weighted least-squares solution
@@ -18,8 +18,7 @@ import numpy as np
 from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.motion.camera import Camera
-from rsvib_torch.motion.field import displacement_factors
+from rsvib_torch.motion.camera import Camera, displacement_factors
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd

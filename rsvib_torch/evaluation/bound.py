@@ -14,13 +14,13 @@ from torch.nn import functional
 
 from rsvib_torch.checks.arguments import check_images, checks_arguments
 from rsvib_torch.checks.validation import Positive
-from rsvib_torch.frames.orientation import frames_to_row_order
+from rsvib_torch.frames.prepare import frames_to_row_order
 from rsvib_torch.imaging import exposure_nodes, rows_showing, simulate_frames
-from rsvib_torch.motion.field import ColumnMotion, displacement_factors
-from rsvib_torch.motion.motion import Motion
+from rsvib_torch.motion.camera import displacement_factors
+from rsvib_torch.motion.motion import ColumnMotion, Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
-from rsvib_torch.numerics.fourier import extend_rows, fast_length
+from rsvib_torch.numerics.interpolation import extend_rows, fast_length
 
 _MARGIN = 16  # px over which the scene closes to a period; 8 and 32 px change these bounds by less than 3e-5
 

@@ -20,9 +20,9 @@ from rsvib_torch.detection.shapes.free import record_of, residual_of_motion, rms
 from rsvib_torch.detection.verdict import recording_reasons
 from rsvib_torch.execution.precision import full_precision, without_gradients
 from rsvib_torch.frames.entry_points import entry_point
-from rsvib_torch.frames.grey import grey_frames
-from rsvib_torch.frames.orientation import (
+from rsvib_torch.frames.prepare import (
     frames_from_row_order,
+    grey_frames,
     magnitudes_from_row_order,
     offsets_from_row_order,
     reasons_from_row_order,

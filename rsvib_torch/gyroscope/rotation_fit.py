@@ -23,7 +23,7 @@ from rsvib_torch.gyroscope.corner_tracks import CELL_COLUMNS, CELL_ROWS, CornerT
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, orientation_matrix
 from rsvib_torch.gyroscope.rotation_search import MIN_FOCAL_LENGTH
 from rsvib_torch.motion.camera import Camera
-from rsvib_torch.numerics.splines import gauss_legendre
+from rsvib_torch.numerics.interpolation import gauss_legendre
 from rsvib_torch.numerics.tables import scaled_inverse, table, tensor
 
 NAMES = ("bias x", "bias y", "bias z", "at", "scale", "focal length", "row time")

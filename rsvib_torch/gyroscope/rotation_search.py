@@ -15,8 +15,7 @@ from torch import Tensor
 
 from rsvib_torch.gyroscope.corner_tracks import CornerTracks
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, orientation_matrix
-from rsvib_torch.motion.camera import Camera
-from rsvib_torch.motion.field import displacement_factors
+from rsvib_torch.motion.camera import Camera, displacement_factors
 
 MIN_FOCAL_LENGTH = 10.0  # px; the result is that of no motion, and refused
 _MOST_OFFSETS = 20_000

@@ -19,7 +19,7 @@ from rsvib_torch.files.free_memory import check_fits
 from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.numerics.splines import (
+from rsvib_torch.numerics.interpolation import (
     bspline_coefficients,
     bspline_coefficients_adjoint,
     bspline_weights,

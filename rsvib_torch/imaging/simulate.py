@@ -11,16 +11,14 @@ from torch import Tensor
 from rsvib_torch.checks.arguments import ArrayLike, as_tensor, channels_appear_last, check_pixels, checks_arguments
 from rsvib_torch.checks.values import check_single
 from rsvib_torch.files.free_memory import check_fits
-from rsvib_torch.frames.column_strips import ColumnStrips
-from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
+from rsvib_torch.frames.prepare import frames_from_row_order, frames_to_row_order
 from rsvib_torch.imaging.blur import form_rows
 from rsvib_torch.imaging.sensor_model import SensorNoise
 from rsvib_torch.imaging.trajectory import exposure_trajectory
-from rsvib_torch.motion.field import ColumnMotion, largest_in_frame, largest_slope
-from rsvib_torch.motion.motion import Motion
+from rsvib_torch.motion.camera import largest_in_frame, largest_slope
+from rsvib_torch.motion.motion import ColumnMotion, ColumnStrips, Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
-from rsvib_torch.numerics.fourier import extend_rows, fast_length
-from rsvib_torch.numerics.splines import bspline_coefficients
+from rsvib_torch.numerics.interpolation import bspline_coefficients, extend_rows, fast_length
 
 _DEGREE = 9  # degree of the spline across rows; its error is 2e-5 of the amplitude at a quarter cycle per pixel
 # px between the visible part and the edge of the scene; the prefilter of the spline decays to 4e-4 within it

@@ -18,6 +18,7 @@ _NEWTON_STEPS = 8  # of the inverse of the distortion; quadratic convergence, 1e
 _LARGEST_ANGLE = 1.55  # rad from the optical axis, of the rays of a fisheye lens; those of 90 degrees have no (u, v, 1)
 _CENTRAL = 1e-5  # squared tangent of the angle, below which series replace quotients of a fisheye lens
 _SAME_ASPECT = 0.01  # of the ratio of width and height; 2160 and 2176 rows of 3840 px are one mode of a camera
+BEYOND_LINEAR = 1.1  # a rotation by 0.05 rad displaces a corner at 60 degrees by 8 % more than its linear part
 _SAME_FOCAL_LENGTH = 0.02  # of both axes of a lens profile; of 1,094, nine in ten differ by less than 1 %
 
 
@@ -236,7 +237,7 @@ class Camera:
         pitch, yaw, roll = self.attitude(components).unbind(-1)
         # Rodrigues: R(-w) r = cos a r - sinc(a) w x r + (1 - cos a) / a^2 w (w . r), a = |w|
         squared = pitch.square() + yaw.square() + roll.square()
-        angle = squared.sqrt() if not components.requires_grad else (squared + 1e-300).sqrt()
+        angle = (squared + 1e-300).sqrt()  # with a derivative at 0
         sine = torch.sinc(angle / math.pi)
         versed = 0.5 * torch.sinc(angle / (2 * math.pi)).square()
         cosine = 1 - versed * squared
@@ -276,3 +277,58 @@ class Camera:
         pitch, yaw = components[..., 1] / self.focal_length, -components[..., 0] / self.focal_length
         roll = -components[..., 2] if components.shape[-1] > 2 else torch.zeros_like(pitch)
         return torch.stack([pitch, yaw, roll], -1)
+
+
+def displacement_factors(x: Tensor, y: Tensor, axes: int, camera: Camera | None = None) -> Tensor:
+    """Displacement by unit components at positions of the scene: ``((1, 0, -y, x), (0, 1, x, y))``, (S, 2, A).
+
+    Positions (S) are in px from the centre of the frame. With a camera, the factors are those of small angles.
+    """
+    if camera is not None:
+        return camera.factors(x, y, axes)
+    x, y = torch.broadcast_tensors(x, y)
+    one, zero = torch.ones_like(x), torch.zeros_like(x)
+    along = torch.stack([one, zero, -y, x][:axes], -1)
+    across = torch.stack([zero, one, x, y][:axes], -1)
+    return torch.stack([along, across], -2)
+
+
+def displacement_at(components: Tensor, x: Tensor, y: Tensor, camera: Camera | None = None) -> Tensor:
+    """Displacement (S, 2) in px of scene content at (x, y) px (S) from the centre, by components (S, A).
+
+    Components (X, Y, theta, zeta) displace it by ``(X - theta y + zeta x, Y + theta x + zeta y)``, with the roll theta
+    in rad and the relative zoom zeta. With a finite focal length (``Camera``), translation displaces columns
+    differently as well.
+    """
+    if camera is not None:
+        return camera.displacement(components, x, y)
+    if components.shape[-1] == 2:
+        return components
+    # products with the matrices of ``displacement_factors`` take twice as long
+    along, across = components[..., 0] - y * components[..., 2], components[..., 1] + x * components[..., 2]
+    if components.shape[-1] > 3:
+        along, across = along + x * components[..., 3], across + y * components[..., 3]
+    return torch.stack([along, across], -1)
+
+
+def _corners(width: float, height: float, like: Tensor) -> tuple[Tensor, Tensor]:
+    """(4,) positions x and y in px of the corners of a frame."""
+    x, y = 0.5 * width, 0.5 * height
+    return like.new_tensor([-x, x, -x, x]), like.new_tensor([-y, -y, y, y])
+
+
+def largest_in_frame(components: Tensor, width: int, height: int, camera: Camera | None = None) -> Tensor:
+    """Bound (..., 2) in px on the displacement in a frame, by components within bounds (..., A)."""
+    factors = displacement_factors(*_corners(width, height, components), components.shape[-1], camera).abs().amax(0)
+    if camera is not None:  # a strong barrel distortion is largest within the frame
+        factors = torch.maximum(factors, torch.eye(2, components.shape[-1]).to(factors))
+    moved: Tensor = (factors @ components[..., None])[..., 0]
+    return moved if camera is None else moved * BEYOND_LINEAR
+
+
+def largest_slope(components: Tensor, width: int, height: int, camera: Camera | None = None) -> Tensor:
+    """Bound (...) in px on the change of the displacement per column, by components within bounds (..., A)."""
+    x, y = _corners(width, height, components)
+    axes = components.shape[-1]
+    along = displacement_factors(x, y, axes, camera) - displacement_factors(x - x.sign(), y, axes, camera)
+    return (along.abs().amax(0) @ components[..., None])[..., 0].amax(-1)

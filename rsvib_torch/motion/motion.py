@@ -1,9 +1,15 @@
-"""The base class of motions: what code outside this package may use of a motion of any type."""
+"""The base class of motions, and motions of columns: displacements that depend on the row only.
 
+In one column, the displacement by a motion with roll, zoom or a camera depends on the row only. Code that requires this
+(docs/architecture.md) is applied to strips of columns, each with the ``ColumnMotion`` of its middle.
+"""
+
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Self
 
 import torch
@@ -11,9 +17,13 @@ from torch import Tensor
 
 from rsvib_torch.checks.arguments import check_broadcast, checked_methods
 from rsvib_torch.checks.values import check_whole_number
-from rsvib_torch.motion.camera import Camera
-from rsvib_torch.motion.timing import MAX_BATCH, SensorTiming, row_axes
+from rsvib_torch.motion.camera import BEYOND_LINEAR, Camera, displacement_at, displacement_factors
+from rsvib_torch.motion.timing import MAX_BATCH, RowTiming, SensorTiming, row_axes
 from rsvib_torch.results.presentation import Result
+
+_FIXED_POINT_STEPS = 2  # the displacement of 10 px changes by 1 % along y: two steps leave 1e-5 px
+_STEP = 1e-6  # s, of the derivative with respect to time; float64 leaves 1e-8 of the velocity
+_RAY_DEGREE = 9  # of a polynomial along a column; rays are then within 1e-6 rad for a field of 80 degrees
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -24,7 +34,7 @@ class Motion(Result, ABC):
     Contract of a motion type. It is a frozen dataclass (``eq=False, repr=False``) whose fields are float64 tensors that
     begin with the batch dimensions, other motions of the same batch shape, and plain numbers for the whole batch. It
     implements the abstract members below. The last axis of every result counts the components: x and y in px, positive
-    to the right and down, then roll in rad and zoom (relative) if there are three or four (see ``motion.field``). Times
+    to the right and down, then roll in rad and zoom (relative) if there are three or four (``displacement_at``). Times
     have any shape S whose leading dimensions are the batch dimensions (or 1), in seconds since the exposure start of
     row 0 of frame 0; results (S, axes) are float64, and differentiable except for bounds. A motion is an immutable
     value.
@@ -180,3 +190,222 @@ class Motion(Result, ABC):
         if not self.batch_shape:
             raise IndexError("this motion is not a batch")
         return self.mapped(lambda values: values[index])
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ColumnMotion(Motion):
+    """Displacement (x, y) in px of the content of single columns, by a motion with roll or zoom, in row order.
+
+    The displacement at time t is that of the row that is being exposed at that time: a row belongs to the frame that
+    started last, and its content lies at the height y of the scene with
+    ``row = middle + y + Y(t) + theta(t) x + zeta(t) y``.
+
+    Args:
+        components: Motion with roll, zoom or a camera, in row order.
+        column: (...) px from the centre of the frame, one for each motion of the batch.
+        frame_starts: Exposure starts of the first rows of the frames in seconds, increasing.
+        row_time: Seconds from one row to the next.
+        num_rows: Rows of a frame.
+    """
+
+    components: Motion
+    column: Tensor
+    frame_starts: tuple[float, ...]
+    row_time: float
+    num_rows: int
+
+    @classmethod
+    def of_columns(
+        cls, motion: Motion, columns: Tensor, timing: RowTiming, num_frames: int, num_rows: int
+    ) -> "ColumnMotion":
+        """Motions (B S) of columns (S,) in px from the centre for a motion (B), stack after stack."""
+        repeated = motion.mapped(lambda values: values.repeat_interleave(len(columns), 0))
+        column = columns.to(dtype=torch.float64, device=motion.device).repeat(*motion.batch_shape)
+        return cls(repeated, column, tuple(timing.frame_starts(num_frames).tolist()), timing.row_time, num_rows)
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """Leading dimensions: (B,)."""
+        return self.components.batch_shape
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the parameters."""
+        return self.components.device
+
+    @property
+    def num_axes(self) -> int:
+        """2: the displacement of one column along x and y."""
+        return 2
+
+    def _heights(self, starts: Tensor, components: Tensor) -> Tensor:
+        """Heights (S) in px from the centre of the frame of the rows exposed from ``starts`` (S) on."""
+        frames = torch.tensor(self.frame_starts, dtype=torch.float64, device=self.device)
+        frame = torch.searchsorted(frames, (starts + 1e-9 * self.row_time).contiguous(), right=True) - 1
+        row = (starts - frames[frame.clamp(min=0)]) / self.row_time
+        heights, _ = torch.broadcast_tensors(row - 0.5 * (self.num_rows - 1), components[..., 0])
+        return torch.as_tensor(heights)
+
+    @cached_property
+    def _ray_coefficients(self) -> Tensor:
+        """(..., 2, K): polynomials of ``y / (0.55 num_rows)`` for the rays u and v of the content of the columns."""
+        camera = self.components.camera or Camera(1.0)
+        degree = _RAY_DEGREE if camera.distorts else 1
+        nodes = torch.cos(math.pi * torch.linspace(0, 1, 4 * degree + 1, dtype=torch.float64, device=self.device))
+        x, y = torch.broadcast_tensors(self.column[..., None], 0.55 * self.num_rows * nodes)
+        values = torch.stack(camera.rays(x, y), -2)
+        powers = nodes[:, None] ** torch.arange(degree + 1, device=self.device)
+        return values @ torch.linalg.pinv(powers).mT
+
+    def _content(self, starts: Tensor, components: Tensor) -> tuple[Tensor, Tensor]:
+        """Content of rows exposed from ``starts`` (S) on, at components (S, A): x and y, or rays u and v, (S)."""
+        height, camera = self._heights(starts, components), self.components.camera
+        trailing = (1,) * (height.ndim - self.column.ndim)
+        if camera is None:
+            x = self.column.reshape(*self.column.shape, *trailing).expand_as(height)
+            scale = 1.0 + components[..., 3] if components.shape[-1] > 3 else 1.0
+            return x, (height - components[..., 1] - components[..., 2] * x) / scale
+        coefficients = self._ray_coefficients.reshape(*self.column.shape, *trailing, 2, -1)
+        y = height - components[..., 1]
+        for step in range(_FIXED_POINT_STEPS + 1):
+            place = (y / (0.55 * self.num_rows)).clamp(-1.0, 1.0)[..., None]
+            rays = coefficients[..., -1].expand(*height.shape, 2)
+            for power in reversed(range(coefficients.shape[-1] - 1)):
+                rays = torch.addcmul(coefficients[..., power], rays, place)
+            u, v = rays.unbind(-1)
+            if step < _FIXED_POINT_STEPS:
+                y = height - camera.displacement_of_rays(components, u, v)[..., 1]
+        return u, v
+
+    def _displaced(self, components: Tensor, content: tuple[Tensor, Tensor]) -> Tensor:
+        """Displacement (S, 2) of ``_content`` by components (S, A)."""
+        camera = self.components.camera
+        if camera is None:
+            return displacement_at(components, *content)
+        return camera.displacement_of_rays(components, *content)
+
+    def _moved(self, starts: Tensor, components: Tensor) -> Tensor:
+        """Displacement (S, 2) of the content of rows exposed from ``starts`` (S) on, by components (S, A)."""
+        return self._displaced(components, self._content(starts, components))
+
+    def displacement(self, times: Tensor) -> Tensor:
+        """Displacement in px of the rows that begin their exposure at these times."""
+        times = times.to(dtype=torch.float64, device=self.device)
+        return self._moved(times, self.components.displacement(times))
+
+    def path(self, starts: Tensor, delays: Tensor) -> Tensor:
+        """Displacement in px during exposures, as ``Motion.path``: a row keeps its position in the frame."""
+        starts = starts.to(dtype=torch.float64, device=self.device)
+        return self._moved(starts[..., None], self.components.path(starts, delays))
+
+    def mean_displacement(self, starts: Tensor, exposure_time: float | Tensor) -> Tensor:
+        """Mean displacement over exposures in px."""
+        starts = starts.to(dtype=torch.float64, device=self.device)
+        return self._moved(starts, self.components.mean_displacement(starts, exposure_time))
+
+    def velocity(self, times: Tensor) -> Tensor:
+        """Velocity in px/s of the content of the row that begins its exposure at these times."""
+        times = times.to(dtype=torch.float64, device=self.device)
+        components, velocity = self.components.displacement(times), self.components.velocity(times)
+        content = self._content(times, components)
+        later, earlier = (self._displaced(components + step * velocity, content) for step in (_STEP, -_STEP))
+        return (later - earlier) / (2 * _STEP)
+
+    def drift(self, times: Tensor) -> Tensor:
+        """Drift of X and Y in px, the same for all columns; that of roll and zoom counts as oscillation."""
+        return self.components.drift(times)[..., :2]
+
+    def _at_ends_of_rows(self, components: Tensor) -> Tensor:
+        """Bound (..., 2) on the displacement by components within bounds (..., A), in any row."""
+        camera, axes = self.components.camera, components.shape[-1]
+        ends = [torch.full_like(self.column, half * self.num_rows) for half in (-0.5, 0.0, 0.5)]
+        reach = torch.stack([displacement_factors(self.column, end, axes, camera).abs() for end in ends]).amax(0)
+        moved: Tensor = (reach @ components[..., None])[..., 0]
+        return moved if camera is None else moved * BEYOND_LINEAR
+
+    def largest_oscillation(self) -> Tensor:
+        """Bound on ``|D(t) - drift(t)|`` during the frames, (..., 2), in px."""
+        last = self.frame_starts[-1] + (self.num_rows + 1) * self.row_time
+        turned = self.components.largest_displacement(self.frame_starts[0], last)  # roll and zoom with their drift
+        return self._at_ends_of_rows(torch.cat([self.components.largest_oscillation()[..., :2], turned[..., 2:]], -1))
+
+    def displacement_within(self, duration: float) -> Tensor:
+        """Bound on the displacement between two times ``duration`` seconds apart, (..., 2), in px."""
+        return self._at_ends_of_rows(self.components.displacement_within(duration))
+
+    def periods_within(self, duration: float) -> Tensor:
+        """Periods of the fastest tone in ``duration`` seconds, (..., 2)."""
+        return self.components.periods_within(duration).amax(-1, keepdim=True).expand(*self.batch_shape, 2)
+
+    def with_axes(self, order: Sequence[int], signs: Sequence[float]) -> Self:
+        """Columns have a position in frames in row order: their axes are not exchanged."""
+        raise NotImplementedError("a ColumnMotion stays in row order; exchange the axes of its components")
+
+
+def check_two_axes(motion: Motion, what: str) -> None:
+    """Raise a ``ValueError`` for a motion that displaces the columns of a row differently."""
+    if not motion.same_for_all_columns:
+        raise ValueError(
+            f"{what} is not defined with roll, zoom or a camera, which displace the columns of a row differently; pass "
+            "a motion with the axes (x, y) only"
+        )
+
+
+@dataclass(frozen=True)
+class ColumnStrips:
+    """Strips of columns of equal width, which overlap by half and are added up with triangular weights.
+
+    Roll and zoom displace the content of a row by amounts that change slowly along the row. What requires a
+    displacement per row is applied to strips, each with the displacement of its middle; between middles the result is
+    interpolated.
+    """
+
+    frame_width: int  # columns of the frame
+    width: int  # columns of a strip
+    firsts: tuple[int, ...]  # first column of each strip
+    middles: tuple[float, ...]  # columns, not necessarily whole, where the weight of each strip is 1
+
+    @classmethod
+    def of(cls, frame_width: int, max_pitch: float, margin: int, *, at_ends: bool = False) -> "ColumnStrips":
+        """Strips whose middles are at most ``max_pitch`` px apart, with ``margin`` px without weight at both ends.
+
+        The middles of the first and the last are half a pitch from the ends of the frame, or the ends (``at_ends``).
+
+        Example:
+            >>> strips = ColumnStrips.of(100, max_pitch=40, margin=4)
+            >>> strips.width, strips.firsts
+            (75, (0, 12, 25))
+            >>> bool(torch.allclose(strips.joined(strips.cut(torch.ones(1, 100))), torch.ones(1, 100)))
+            True
+        """
+        length = frame_width - at_ends
+        count = max(1, math.ceil(length / max_pitch))
+        step = length / count
+        middles = [n * step if at_ends else (n + 0.5) * step - 0.5 for n in range(count + at_ends)]
+        width = min(frame_width, math.ceil(2 * step) + 2 * margin)
+        firsts = tuple(min(max(round(middle - 0.5 * (width - 1)), 0), frame_width - width) for middle in middles)
+        return cls(frame_width, width, firsts, tuple(middles))
+
+    @property
+    def columns(self) -> Tensor:
+        """(S,) float64 px, middles of the strips from the centre of the frame."""
+        return torch.tensor(self.middles, dtype=torch.float64) - 0.5 * (self.frame_width - 1)
+
+    def cut(self, images: Tensor) -> Tensor:
+        """Strips (B S, ..., w) of images (B, ..., W)."""
+        return torch.stack([images[..., first : first + self.width] for first in self.firsts], 1).flatten(0, 1)
+
+    def joined(self, strips: Tensor) -> Tensor:
+        """Images (B, ..., W) from strips (B S, ..., w), or on a finer grid whose first point lies at column 0."""
+        last, scale = len(self.firsts) - 1, strips.shape[-1] // self.width
+        step = self.middles[1] - self.middles[0] if last else 1.0
+        each = strips.unflatten(0, (-1, last + 1))
+        total = strips.new_zeros(*each[:, 0].shape[:-1], scale * self.frame_width)
+        place = torch.arange(scale * self.width, device=strips.device)
+        for number, (first, middle) in enumerate(zip(self.firsts, self.middles, strict=True)):
+            away = (place + scale * (first - middle)) / (scale * step)
+            away = away.clamp(min=0.0) if number == 0 else away
+            away = away.clamp(max=0.0) if number == last else away
+            weight = (1 - away.abs()).clamp(min=0.0).to(strips.dtype)
+            total[..., scale * first : scale * (first + self.width)] += weight * each[:, number]
+        return total

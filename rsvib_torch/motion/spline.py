@@ -15,7 +15,7 @@ from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import MAX_START_TIME, MIN_ROW_TIME
 from rsvib_torch.motion.vibration import TensorLike, Vibration
-from rsvib_torch.numerics.splines import bspline_coefficients, bspline_weights, gauss_legendre
+from rsvib_torch.numerics.interpolation import bspline_coefficients, bspline_weights, gauss_legendre
 from rsvib_torch.results.presentation import axis_head, axis_rows
 from rsvib_torch.text import measured_text, text_table
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.motion.field import displacement_factors
+from rsvib_torch.motion.camera import displacement_factors
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array, table, tensor
 

@@ -27,7 +27,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.execution.parallel import chunks, in_parallel
-from rsvib_torch.numerics.fourier import fast_length
+from rsvib_torch.numerics.interpolation import fast_length
 from rsvib_torch.registration.row_spectra import combined, differences, inner_columns, mean_over_frames
 
 BLOCK = 16  # px, side of the blocks of pixels that share a weight

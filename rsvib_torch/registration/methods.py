@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.execution.parallel import chunks, in_parallel
-from rsvib_torch.numerics.fourier import fast_length
+from rsvib_torch.numerics.interpolation import fast_length
 from rsvib_torch.numerics.tables import Array, table, tensor
 
 BINNING = 4  # columns that are averaged in the search for whole pixels; a parabola recovers the single pixel

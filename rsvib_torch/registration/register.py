@@ -21,11 +21,10 @@ from rsvib_torch.checks.values import check_choice
 from rsvib_torch.execution.parallel import at_once, chunks, runs
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.entry_points import frames_options
-from rsvib_torch.frames.orientation import offsets_from_row_order, sequence_from_row_order
 from rsvib_torch.frames.pixels import smoothed
-from rsvib_torch.frames.prepare import prepare_frames
+from rsvib_torch.frames.prepare import offsets_from_row_order, prepare_frames, sequence_from_row_order
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
-from rsvib_torch.numerics.fourier import fast_length
+from rsvib_torch.numerics.interpolation import fast_length
 from rsvib_torch.options import BandRegistrationOptions, RegistrationOptions
 from rsvib_torch.registration.methods import BAND_METHODS, BandTask, template_margin
 from rsvib_torch.results.presentation import Result

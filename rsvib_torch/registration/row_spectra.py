@@ -13,7 +13,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.execution.parallel import at_once, chunks, gathered, runs
-from rsvib_torch.numerics.fourier import (
+from rsvib_torch.numerics.interpolation import (
+    bspline_coefficient_rows,
+    bspline_weights,
     extend_rows,
     fast_length,
     phase_products,
@@ -21,7 +23,6 @@ from rsvib_torch.numerics.fourier import (
     shift_phases,
     squared_modulus,
 )
-from rsvib_torch.numerics.splines import bspline_coefficient_rows, bspline_weights
 
 DEGREE = 7  # of the B-spline across rows: its smoothing and the noise it correlates lie above the pass band in use
 MARGIN = 8  # px; rows and columns this close to an edge have no weight: they are interpolated from extended values

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from rsvib_torch.execution.parallel import allowed_threads, at_once, in_parallel, runs
 from rsvib_torch.execution.progress import steps
-from rsvib_torch.numerics.fourier import extend_rows
+from rsvib_torch.numerics.interpolation import extend_rows
 from rsvib_torch.numerics.tables import table, take_stacks
 from rsvib_torch.options import ExactOptions
 from rsvib_torch.restoration.finer_grid import (

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from rsvib_torch.numerics.fourier import squared_modulus
+from rsvib_torch.numerics.interpolation import squared_modulus
 from rsvib_torch.restoration.frame_motion import FrameMotion, warn_of_restoration
 from rsvib_torch.restoration.observation import SCALE, kernel_spectrum
 from rsvib_torch.restoration.scene_prior import observed_spectrum, smeared

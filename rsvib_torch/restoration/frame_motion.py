@@ -24,14 +24,11 @@ from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.values import check_whole_number, described
 from rsvib_torch.files.free_memory import check_fits
 from rsvib_torch.files.reading import Table
-from rsvib_torch.frames.column_strips import ColumnStrips
-from rsvib_torch.frames.orientation import offsets_from_row_order
-from rsvib_torch.frames.prepare import PreparedFrames
-from rsvib_torch.imaging.trajectory import exposure_trajectory, rows_and_displacement
+from rsvib_torch.frames.prepare import PreparedFrames, offsets_from_row_order
+from rsvib_torch.imaging.trajectory import exposure_trajectory, places, recorded_offsets, rows_and_displacement
+from rsvib_torch.motion.camera import largest_in_frame, largest_slope
 from rsvib_torch.motion.detected_vibration import DetectedVibration
-from rsvib_torch.motion.field import ColumnMotion, largest_in_frame, largest_slope
-from rsvib_torch.motion.motion import Motion
-from rsvib_torch.motion.sampling import places, recorded_offsets
+from rsvib_torch.motion.motion import ColumnMotion, ColumnStrips, Motion
 from rsvib_torch.motion.timing import MAX_ROWS, RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.options import RestorationOptions
@@ -295,7 +292,7 @@ def restore_in_strips(method: Method, frames: MovingFrames, options: Restoration
     of_frames.check_fits(width)
     cut = replace(frames.mapped(strips.cut), motion=of_frames, strips=len(strips.firsts))
     restored = method(cut, options)
-    return strips.finer(restored.shape[-1] // strips.width).joined(restored)
+    return strips.joined(restored)
 
 
 class RestorationWarning(UserWarning):

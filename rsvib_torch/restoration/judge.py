@@ -20,16 +20,13 @@ from rsvib_torch.checks.values import check_whole_number
 from rsvib_torch.execution.parallel import at_once, runs
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.entry_points import load_frames
-from rsvib_torch.frames.orientation import reasons_from_row_order
 from rsvib_torch.frames.pixels import detailed_parts
-from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
+from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames, reasons_from_row_order
 from rsvib_torch.imaging.blur import form_rows
 from rsvib_torch.motion.detected_vibration import DetectedVibration
-from rsvib_torch.motion.field import ColumnMotion
-from rsvib_torch.motion.motion import Motion
+from rsvib_torch.motion.motion import ColumnMotion, Motion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.numerics.fourier import extended_length, spline_spectra
-from rsvib_torch.numerics.splines import correlated
+from rsvib_torch.numerics.interpolation import correlated, extended_length, spline_spectra
 from rsvib_torch.numerics.tables import Array, table, tables, valid_mean
 from rsvib_torch.restoration.frame_motion import (
     FrameMotion,

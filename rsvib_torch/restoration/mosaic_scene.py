@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.execution.progress import steps
-from rsvib_torch.frames.mosaic import interpolated_colours, measures
-from rsvib_torch.numerics.fourier import extend_rows
+from rsvib_torch.frames.pixels import interpolated_colours, measures
+from rsvib_torch.numerics.interpolation import extend_rows
 from rsvib_torch.options import ExactOptions
 from rsvib_torch.restoration.finer_grid import fit_polynomial_prior, phase_spread
 from rsvib_torch.restoration.frame_motion import FrameMotion, MovingFrames, joint_groups, warn_of_restoration

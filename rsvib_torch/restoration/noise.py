@@ -18,7 +18,7 @@ from torch import Tensor
 
 from rsvib_torch.execution.parallel import at_once, runs
 from rsvib_torch.frames.pixels import cut_parts
-from rsvib_torch.numerics.fourier import squared_modulus
+from rsvib_torch.numerics.interpolation import squared_modulus
 from rsvib_torch.numerics.tables import Array, constant, median, quantile, table, tables, valid_mean, without_nan
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.observation import RowKernels

@@ -32,8 +32,7 @@ from torch import Tensor
 from rsvib_torch.execution.parallel import at_once, runs
 from rsvib_torch.imaging.blur import row_taps, row_transfer
 from rsvib_torch.numerics.banded_solver import from_both_ends
-from rsvib_torch.numerics.fourier import shift_phases, waves
-from rsvib_torch.numerics.splines import bspline_weights, correlated, gauss_legendre
+from rsvib_torch.numerics.interpolation import bspline_weights, correlated, gauss_legendre, shift_phases, waves
 from rsvib_torch.numerics.tables import constant
 
 KERNEL_REACH = 3  # rows on either side; support of the kernel

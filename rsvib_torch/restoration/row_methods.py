@@ -14,21 +14,23 @@ from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.values import check_single, check_whole_number, described
 from rsvib_torch.execution.parallel import at_once, gathered, runs
 from rsvib_torch.execution.progress import steps
-from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
+from rsvib_torch.frames.prepare import frames_from_row_order, frames_to_row_order
 from rsvib_torch.imaging.blur import RowPSF, RowVaryingBlur, trajectory_psf
 from rsvib_torch.imaging.trajectory import exposure_trajectory
-from rsvib_torch.motion.field import check_two_axes
-from rsvib_torch.motion.motion import Motion
+from rsvib_torch.motion.motion import Motion, check_two_axes
 from rsvib_torch.motion.timing import MAX_ROWS, SensorTiming, check_timing
-from rsvib_torch.numerics.fourier import (
+from rsvib_torch.numerics.interpolation import (
+    bspline_coefficients,
+    bspline_weights,
+    correlated,
     extend_rows,
     extended_length,
+    mirrored,
     shift_phases,
     spline_spectra,
     squared_modulus,
     waves,
 )
-from rsvib_torch.numerics.splines import bspline_coefficients, bspline_weights, correlated, mirrored
 from rsvib_torch.options import BandedOptions, DewarpOptions, RichardsonLucyOptions
 from rsvib_torch.restoration.frame_motion import FrameMotion, MovingFrames, frame_motion
 from rsvib_torch.restoration.noise import estimate_noise

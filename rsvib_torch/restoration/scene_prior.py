@@ -15,8 +15,7 @@ from torch.nn import functional
 
 from rsvib_torch.execution.parallel import at_once, runs
 from rsvib_torch.numerics.banded_solver import factor_banded
-from rsvib_torch.numerics.fourier import extend_rows, squared_modulus, waves
-from rsvib_torch.numerics.splines import mirrored
+from rsvib_torch.numerics.interpolation import extend_rows, mirrored, squared_modulus, waves
 from rsvib_torch.numerics.tables import Array, constant, table, tables
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.observation import Observation, RowKernels, kernel_spectrum

@@ -28,7 +28,7 @@ from rsvib_torch.numerics.banded_solver import (
     node_frequencies,
     solve_halves,
 )
-from rsvib_torch.numerics.fourier import extend_rows, extended_length, fast_length
+from rsvib_torch.numerics.interpolation import extend_rows, extended_length, fast_length
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.observation import Observation, frequencies_of
 

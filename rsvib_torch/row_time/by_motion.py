@@ -19,8 +19,7 @@ from rsvib_torch.checks.values import check_number
 from rsvib_torch.execution.parallel import threads_for
 from rsvib_torch.execution.precision import full_precision, without_gradients
 from rsvib_torch.frames.entry_points import entry_point
-from rsvib_torch.frames.grey import grey_frames
-from rsvib_torch.frames.orientation import reasons_from_row_order
+from rsvib_torch.frames.prepare import grey_frames, reasons_from_row_order
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import MaskedInputOptions, RegistrationOptions
 from rsvib_torch.results.reason import Reason

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsvib_torch.execution.progress import steps
-from rsvib_torch.frames.grey import GreyFrames
+from rsvib_torch.frames.prepare import GreyFrames
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.registration.corners import CornerFollower, Corners, eight_bits

@@ -26,7 +26,7 @@ from rsvib_torch.detection.start import band_curve, measurements_of_curve
 from rsvib_torch.detection.tones.fit import MIN_GAIN
 from rsvib_torch.detection.tones.selection import F_THRESHOLD
 from rsvib_torch.detection.verdict import residual_reasons, with_remedy
-from rsvib_torch.frames.grey import GreyFrames
+from rsvib_torch.frames.prepare import GreyFrames
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.numerics.tables import Array, scaled_inverse, tensor

@@ -14,8 +14,7 @@ from torch import Tensor
 from rsvib_torch.checks.arguments import PathLike
 from rsvib_torch.checks.values import check_choice
 from rsvib_torch.detection import MotionDetection, detect_motion, detect_vibration
-from rsvib_torch.frames.mosaic import check_mosaic, colour_frames
-from rsvib_torch.frames.pixels import enlarged
+from rsvib_torch.frames.pixels import check_mosaic, colour_frames, enlarged
 from rsvib_torch.io import full_scale as scales
 from rsvib_torch.io.frame_reader import FrameError, FrameReader
 from rsvib_torch.io.frame_times import exposure_times, timing_of_stack

@@ -14,8 +14,7 @@ from torch import Tensor
 from rsvib_torch.checks.values import MAX_NUMBER, beyond_full_scale
 from rsvib_torch.detection import MotionDetection
 from rsvib_torch.detection.verdict import MAX_DISPLACEMENT_STD
-from rsvib_torch.frames.grey import constant_frame
-from rsvib_torch.frames.prepare import prepare_frames
+from rsvib_torch.frames.prepare import constant_frame, prepare_frames
 from rsvib_torch.imaging.sensor_model import sharpened
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion

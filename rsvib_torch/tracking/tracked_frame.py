@@ -15,8 +15,7 @@ from rsvib_torch.detection.sensitivity import timing_sensitivity, with_row_time_
 from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.detection.tones.fit import ToneFit, displacement_std, residual_of, vibration_of_fit
 from rsvib_torch.detection.verdict import Findings
-from rsvib_torch.frames.orientation import frames_from_row_order
-from rsvib_torch.frames.prepare import PreparedFrames
+from rsvib_torch.frames.prepare import PreparedFrames, frames_from_row_order
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.numerics.tables import Array, table, tensor

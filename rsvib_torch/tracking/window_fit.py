@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded, solve_triangular
 
-from rsvib_torch.numerics.splines import spline_taps
+from rsvib_torch.numerics.interpolation import spline_taps
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.registration.corners import Corners, reduction
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
 from torch import Tensor
 
-from rsvib_torch.motion.field import largest_in_frame
+from rsvib_torch.motion.camera import largest_in_frame
 from rsvib_torch.numerics.tables import Array, table, tensor
 
 Pixels = TypeVar("Pixels", Tensor, Array)

@@ -17,13 +17,13 @@ from torch.nn.functional import conv1d, embedding_bag
 
 from rsvib_torch.execution.parallel import chunks
 from rsvib_torch.frames.prepare import prepare_frames
+from rsvib_torch.imaging.trajectory import places, recorded_offsets
 from rsvib_torch.io.full_scale import counts_to_frames, frames_to_counts
 from rsvib_torch.io.video import Picture
-from rsvib_torch.motion.sampling import places, recorded_offsets
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
-from rsvib_torch.numerics.splines import mirrored
+from rsvib_torch.numerics.interpolation import mirrored
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.restoration.restore import WITH_SATURATION, restore_prepared
 from rsvib_torch.stacks.job import StackJob

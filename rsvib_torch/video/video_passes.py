@@ -18,10 +18,10 @@ from rsvib_torch.execution.parallel import ONE_BLAS_THREAD, prefetched
 from rsvib_torch.gyroscope.corner_tracks import followed_pair, tracks_of_pairs
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
 from rsvib_torch.gyroscope.rotation_alignment import AlignOptions, RotationAlignment, align_rates
+from rsvib_torch.imaging.trajectory import places_at_rest, recorded_offsets
 from rsvib_torch.io.video import VideoReader
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.detected_vibration import DetectedVibration
-from rsvib_torch.motion.sampling import places_at_rest, recorded_offsets
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.numerics.tables import Array

@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from truth import draw_scene
 
 from rsvib_torch import FreeMotion, SensorTiming, Vibration, simulate_frames
-from rsvib_torch.motion.field import ColumnMotion, displacement_at, largest_in_frame
-from rsvib_torch.motion.sampling import places, places_at_rest, recorded_offsets
+from rsvib_torch.imaging.trajectory import places, places_at_rest, recorded_offsets
+from rsvib_torch.motion.camera import displacement_at, largest_in_frame
+from rsvib_torch.motion.motion import ColumnMotion
 
 TIMING = SensorTiming(row_time=8e-5, exposure_rows=20, frame_rows=300)
 ORIENTATIONS = [(-2, "forward"), (-2, "reverse"), (-1, "forward"), (-1, "reverse")]

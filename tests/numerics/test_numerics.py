@@ -8,8 +8,13 @@ from scipy.interpolate import BSpline
 from scipy.linalg import solveh_banded
 
 from rsvib_torch.numerics.banded_solver import factor_banded, from_both_ends, solve_halves
-from rsvib_torch.numerics.fourier import extend_rows, extended_length
-from rsvib_torch.numerics.splines import bspline_coefficients, bspline_weights, mirrored
+from rsvib_torch.numerics.interpolation import (
+    bspline_coefficients,
+    bspline_weights,
+    extend_rows,
+    extended_length,
+    mirrored,
+)
 
 DEGREES = (1, 3, 5, 9)
 

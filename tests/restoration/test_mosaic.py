@@ -10,7 +10,7 @@ from refusals import without_warning
 from truth import decibel, draw_scene
 
 import rsvib_torch as rsv
-from rsvib_torch.frames.mosaic import colour_frames, is_mosaic
+from rsvib_torch.frames.pixels import colour_frames, is_mosaic
 from rsvib_torch.restoration import RestorationWarning
 from rsvib_torch.restoration.finer_grid import PolynomialPrior
 from rsvib_torch.restoration.frame_motion import frame_motion

@@ -20,10 +20,9 @@ from torch import Tensor
 from rsvib_torch.detection.measurements import Measurements, trimmed_mean
 from rsvib_torch.detection.rows.warping import Positions, differently_blurred, exposure_paths, moments, warp_to_scene
 from rsvib_torch.execution.parallel import chunks, runs
-from rsvib_torch.frames.column_strips import ColumnStrips
-from rsvib_torch.motion.motion import Motion
+from rsvib_torch.motion.motion import ColumnStrips, Motion
 from rsvib_torch.motion.timing import RowTiming
-from rsvib_torch.numerics.fourier import extend_rows, fast_length
+from rsvib_torch.numerics.interpolation import extend_rows, fast_length
 from rsvib_torch.numerics.tables import Array, table, tables
 from rsvib_torch.registration.gradients import BLOCK, RowGradients, residual_products, row_equations, row_gradients
 from rsvib_torch.registration.row_spectra import EVERY, RowSpectra, column_pattern, overlapping

@@ -29,9 +29,8 @@ from rsvib_torch.detection.rows.displacements import (
 from rsvib_torch.detection.rows.warping import differently_blurred
 from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.execution.progress import steps
-from rsvib_torch.frames.column_strips import ColumnStrips
-from rsvib_torch.motion.field import ColumnMotion, largest_slope
-from rsvib_torch.motion.motion import Motion
+from rsvib_torch.motion.camera import largest_slope
+from rsvib_torch.motion.motion import ColumnMotion, ColumnStrips, Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration
@@ -280,7 +279,7 @@ def grouped_strips(
     along = of_ends.mean_displacement(times, timing.exposure_time)[..., 0] - of_ends.drift(times)[..., 0]
     margin = math.ceil(float(along.abs().amax()) + 1.0) + MARGIN  # 1 px: whole pixels of an image motion
     slope = _slope(field, scale, starts)
-    strips = ColumnStrips.between_ends(scale.width, _pitch(slope), margin)
+    strips = ColumnStrips.of(scale.width, _pitch(slope), margin, at_ends=True)
     spectra = stack_spectra(frames, valid, strips)
     columns = strips.columns.to(frames.device)
     view = ColumnMotion.of_columns(field, columns, timing, count, scale.height)

@@ -19,7 +19,7 @@ from torch.nn import functional
 from rsvib_torch.imaging.trajectory import exposure_trajectory, gauss_node_count, rows_showing
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming
-from rsvib_torch.numerics.splines import correlated
+from rsvib_torch.numerics.interpolation import correlated
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.registration.row_spectra import MARGIN, RowSpectra
 

@@ -36,14 +36,18 @@ from rsvib_torch.detection.verdict import rotation_reasons, scene_reasons
 from rsvib_torch.execution.parallel import threads_for
 from rsvib_torch.execution.precision import full_precision, without_gradients
 from rsvib_torch.frames.entry_points import frames_options
-from rsvib_torch.frames.grey import GreyFrames, grey_frames
-from rsvib_torch.frames.orientation import findings_from_row_order, magnitudes_from_row_order, offsets_from_row_order
-from rsvib_torch.motion.field import ColumnMotion
-from rsvib_torch.motion.motion import Motion
+from rsvib_torch.frames.prepare import (
+    GreyFrames,
+    findings_from_row_order,
+    grey_frames,
+    magnitudes_from_row_order,
+    offsets_from_row_order,
+)
+from rsvib_torch.motion.motion import ColumnMotion, Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration
-from rsvib_torch.numerics.splines import gauss_legendre
+from rsvib_torch.numerics.interpolation import gauss_legendre
 from rsvib_torch.numerics.tables import Array, table, tensor
 from rsvib_torch.options import FreeMotionOptions, RegistrationOptions
 from rsvib_torch.results.presentation import AXIS_NAMES, JudgedResult, axis_rows, verdict_table

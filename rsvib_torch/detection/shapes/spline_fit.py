@@ -17,7 +17,7 @@ from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.execution.parallel import runs
-from rsvib_torch.numerics.splines import gauss_legendre, spline_taps
+from rsvib_torch.numerics.interpolation import gauss_legendre, spline_taps
 from rsvib_torch.numerics.tables import Array, table, tensor
 
 _SECOND = (1.0, -2.0, 1.0)  # second difference

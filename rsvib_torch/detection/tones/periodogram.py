@@ -8,7 +8,7 @@ from scipy import ndimage
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.tones.fit import MIN_GAIN, ToneFit, fit_roughly, residual_of, tone_response
 from rsvib_torch.execution.parallel import runs
-from rsvib_torch.numerics.fourier import fourier_sums
+from rsvib_torch.numerics.interpolation import fourier_sums
 from rsvib_torch.numerics.tables import Array, quantile, split_axis, take_stacks, without_nan
 
 _OVERSAMPLING = 8  # grid points per 1 / duration: a peak between two of them keeps 98 % of its height

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.evaluation.mtf.edge import EdgeFit, Scatter, edge_spread, linearised, moved
-from rsvib_torch.numerics.splines import bspline_weights
+from rsvib_torch.numerics.interpolation import bspline_weights
 
 _EDGE = 11  # parameters of ``EdgeFit``; all coefficients of the departure follow them
 _BLUR, _DARK, _BRIGHT = 4, 5, 8  # log blur, and values of the sides in the middle of the ROI, among them
