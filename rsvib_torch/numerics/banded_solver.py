@@ -28,74 +28,8 @@ from torch import Tensor
 from torch.autograd.function import BackwardCFunction, once_differentiable
 
 
-class _Solution(NamedTuple):
-    """Memory of a solution."""
-
-    x: Tensor  # (K + b, M, S)
-    rows: tuple[Tensor, ...]  # the K first rows
-    runs: tuple[Tensor, ...]  # rows j ... j + b - 1, for j = 0 ... K
-
-
-@dataclass(frozen=True, eq=False)
-class _Triangle:
-    """Rows of U of a batch of matrices.
-
-    The views of every step are kept with the memory of the solution, because creating them takes as long as a solution
-    of few systems.
-    """
-
-    # (K, b, S), ``[j, i - 1]`` is ``U[j, j + i]``; rows that are not eliminated are 0
-    upper: Tensor
-    inverse: Tensor  # (steps, S), ``1 / d_j`` of the eliminated rows, real
-    _solutions: dict[int, "_Solution"] = field(default_factory=dict)
-
-    @cached_property
-    def _rows(self) -> tuple[Tensor, ...]:
-        """U right of the diagonal, (b, 1, S) of each eliminated row."""
-        return self.upper[: len(self.inverse), :, None].unbind()
-
-    @cached_property
-    def _columns(self) -> tuple[Tensor, ...]:
-        """U above the diagonal, (b, 1, S) of the columns from b on."""
-        (count, width, size), (line, entry, _) = self.upper.shape, self.upper.stride()
-        shape, first = (max(0, count - width), width, 1, size), self.upper.storage_offset() + (width - 1) * entry
-        return self.upper.as_strided(shape, (line, line - entry, entry, 1), first).unbind()
-
-    def memory(self, right_side: Tensor) -> "_Solution":
-        """Memory for right sides (_, M, _), whose rows beyond the last one are 0."""
-        count, width, size = self.upper.shape
-        channels = right_side.shape[1]
-        if channels not in self._solutions:
-            x = right_side.new_empty(count + width, channels, size)
-            self._solutions[channels] = _Solution(x, x[:count].unbind(), x.unfold(0, width, 1).movedim(-1, 1).unbind())
-        memory = self._solutions[channels]
-        memory.x[count:] = 0
-        return memory
-
-    def forward(self, memory: "_Solution") -> None:
-        """Replace the conjugates of the right sides by y, those of rows that are not eliminated by what is left."""
-        x, rows, runs = memory
-        # U^H y = g is U^T y^* = g^*: both substitutions use the same U
-        for value, row, below in zip(rows, self._rows, runs[1:], strict=False):
-            below.addcmul_(row, value, value=-1)
-        if x.is_complex():
-            x.conj_physical_()
-        x[: len(self.inverse)].mul_(self.inverse[:, None])
-
-    def backward(self, memory: "_Solution") -> None:
-        """Replace y by the solution, which rows that are not eliminated contain."""
-        x, rows, runs = memory
-        count, width, _ = self.upper.shape
-        for j in range(count - 1, width - 1, -1):
-            runs[j - width].addcmul_(self._columns[j - width], rows[j], value=-1)
-        # the first b rows, row by row
-        for j in range(min(width - 1, len(self._rows)) - 1, -1, -1):
-            later = x[j + 1 : width]
-            rows[j].sub_((self._rows[j][: len(later)] * later).sum(0))
-
-
-def _eliminated(skewed: Tensor, steps: int) -> _Triangle:
-    """Eliminate the first rows of skewed matrices (K + b, 2 b + 1, S), in their own memory."""
+def _eliminated(skewed: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+    """Eliminate the first rows of skewed matrices (K + b, 2 b + 1, S), in their memory: ``upper`` and ``inverse``."""
     width, (line, entry, _) = skewed.shape[1] // 2, skewed.stride()
     first = skewed.storage_offset() + line
     pivots, upper = skewed[:steps, width], skewed[: len(skewed) - width, width + 1 :]
@@ -108,7 +42,7 @@ def _eliminated(skewed: Tensor, steps: int) -> _Triangle:
     for pivot, over, row, column, rest in zip(*(values.unbind() for values in views), strict=True):
         torch.reciprocal(pivot, out=over)
         rest.addcmul_(column, row.mul_(over), value=-1)
-    return _Triangle(upper, inverse.real if inverse.is_complex() else inverse)
+    return upper, inverse.real if inverse.is_complex() else inverse
 
 
 def from_both_ends(skewed: Tensor) -> Tensor:
@@ -129,54 +63,91 @@ def from_both_ends(skewed: Tensor) -> Tensor:
     return torch.cat([halves, halves.new_zeros(width, *halves.shape[1:])])
 
 
+class _Memory(NamedTuple):
+    """Memory of a solution, with the views of every step: creating them takes as long as a solution of few systems."""
+
+    x: Tensor  # (H + b, M, 2 S), the last rows are 0
+    rows: tuple[Tensor, ...]  # the H first rows
+    runs: tuple[Tensor, ...]  # rows j ... j + b - 1, for j = 0 ... H
+
+
 @dataclass(frozen=True, eq=False)
 class BandedFactor:
-    """``A = U^H D U`` of a batch of banded matrices, eliminated from both ends.
+    """``A = U^H D U`` of a batch of banded matrices, eliminated from both ends: 2 S halves of H rows.
 
     A factor must not be used by two threads at the same time.
     """
 
-    ends: _Triangle  # of the halves, (2 S) systems
+    # (H, b, 2 S), ``[j, i - 1]`` is ``U[j, j + i]``; rows that are not eliminated are 0
+    upper: Tensor
+    inverse: Tensor  # (steps, 2 S), ``1 / d_j`` of the eliminated rows, real
     # U^-1 (m, m, S) and 1 / D (m, S) of what is left of the m middle rows: the inverse of the matrix itself loses three
     # times as much to rounding
     middle: Tensor
     middle_inverse: Tensor
+    _memories: dict[int, _Memory] = field(default_factory=dict)
 
     @property
     def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Values that define the factor."""
-        return self.ends.upper, self.ends.inverse, self.middle, self.middle_inverse
-
-    @classmethod
-    def of_tensors(cls, upper: Tensor, inverse: Tensor, middle: Tensor, middle_inverse: Tensor) -> "BandedFactor":
-        """The opposite of ``tensors``."""
-        return cls(_Triangle(upper, inverse), middle, middle_inverse)
+        return self.upper, self.inverse, self.middle, self.middle_inverse
 
     def log_determinant(self) -> Tensor:
         """Logarithms (S,) of the determinants of the matrices, float64."""
-        ends, middle = (inverse.double().log().sum(0) for inverse in (self.ends.inverse, self.middle_inverse))
+        ends, middle = (inverse.double().log().sum(0) for inverse in (self.inverse, self.middle_inverse))
         return -(ends.view(2, -1).sum(0) + middle)
 
     def halves(self, values: Tensor) -> Tensor:
         """The halves (H, M, 2 S) of values (K, M, S)."""
-        half = len(self.ends.upper)
+        half = len(self.upper)
         return torch.cat([values[:half], values.flip(0)[:half]], -1)
+
+    @cached_property
+    def _rows(self) -> tuple[Tensor, ...]:
+        """U right of the diagonal, (b, 1, 2 S) of each eliminated row."""
+        return self.upper[: len(self.inverse), :, None].unbind()
+
+    @cached_property
+    def _columns(self) -> tuple[Tensor, ...]:
+        """U above the diagonal, (b, 1, 2 S) of the columns from b on."""
+        (half, width, size), (line, entry, _) = self.upper.shape, self.upper.stride()
+        shape, first = (max(0, half - width), width, 1, size), self.upper.storage_offset() + (width - 1) * entry
+        return self.upper.as_strided(shape, (line, line - entry, entry, 1), first).unbind()
+
+    def _memory(self, right_side: Tensor) -> _Memory:
+        """Memory for right sides (K, M, S)."""
+        (half, width, size), channels = self.upper.shape, right_side.shape[1]
+        if channels not in self._memories:
+            x = right_side.new_zeros(half + width, channels, size)
+            self._memories[channels] = _Memory(x, x[:half].unbind(), x.unfold(0, width, 1).movedim(-1, 1).unbind())
+        return self._memories[channels]
 
     def solve(self, right_side: Tensor) -> Tensor:
         """Solve ``A x = right_side`` for right sides (K, M, S)."""
-        half, steps, size = len(self.ends.upper), len(self.ends.inverse), right_side.shape[-1]
-        ends = self.ends.memory(right_side)
-        both = ends.x[:half]
+        (half, width, _), steps = self.upper.shape, len(self.inverse)
+        x, rows, runs = self._memory(right_side)
+        both = x[:half]
         both.copy_(self.halves(right_side).conj())
-        first, second = both.split(size, -1)
+        first, second = both.split(right_side.shape[-1], -1)
         second[steps:] = 0
-        self.ends.forward(ends)
-        # what both ends leave of the middle rows
+        x[half:] = 0
+        # 1. U^H y = g is U^T y^* = g^*: both substitutions use the same U.
+        for value, row, below in zip(rows, self._rows, runs[1:], strict=False):
+            below.addcmul_(row, value, value=-1)
+        if x.is_complex():
+            x.conj_physical_()
+        x[:steps].mul_(self.inverse[:, None])
+        # 2. What both ends leave of the middle rows.
         middle = first[steps:] + second[steps:].flip(0)
         middle = (self.middle.conj()[:, :, None] * middle[:, None]).sum(0) * self.middle_inverse[:, None]
         middle = (self.middle[:, :, None] * middle).sum(1)
         both[steps:] = torch.cat([middle, middle.flip(0)], -1)
-        self.ends.backward(ends)
+        # 3. U x = y, the first b rows one by one.
+        for j in range(half - 1, width - 1, -1):
+            runs[j - width].addcmul_(self._columns[j - width], rows[j], value=-1)
+        for j in range(min(width - 1, steps) - 1, -1, -1):
+            later = x[j + 1 : width]
+            rows[j].sub_((self._rows[j][: len(later)] * later).sum(0))
         return torch.cat([first, second[:steps].flip(0)])
 
 
@@ -190,7 +161,7 @@ def factor_banded(halves: Tensor, count: int) -> BandedFactor:
     middle = halves.new_zeros(half - steps + width, 2 * width + 1, size)
     torch.add(first, second.flip(0, 1), out=middle[: half - steps])
     halves[steps:half, width + 1 :] = 0
-    inverse = _eliminated(middle, half - steps).inverse
+    _, inverse = _eliminated(middle, half - steps)
     # the middle rows as dense matrices: a strided view, because each row begins one column further right
     line, entry, _ = middle.stride()
     dense = middle.as_strided((half - steps, half - steps, size), (line - entry, entry, 1), width * entry).movedim(
@@ -198,7 +169,7 @@ def factor_banded(halves: Tensor, count: int) -> BandedFactor:
     )
     identity = torch.eye(half - steps, dtype=halves.dtype, device=halves.device)
     upper = torch.linalg.solve_triangular(dense, identity, upper=True, unitriangular=True)
-    return BandedFactor(ends, upper.movedim(0, -1).contiguous(), inverse)
+    return BandedFactor(*ends, upper.movedim(0, -1).contiguous(), inverse)
 
 
 class _Solve(torch.autograd.Function):
@@ -219,11 +190,11 @@ class _Solve(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: BackwardCFunction, gradient: Tensor) -> tuple[Tensor | None, Tensor]:
         *tensors, x = list(ctx.saved_tensors)
-        factor = BandedFactor.of_tensors(*tensors)
+        factor = BandedFactor(*tensors)
         adjoint = factor.solve(gradient)
         if not ctx.needs_input_grad[0]:
             return None, adjoint
-        count, width, size = factor.ends.upper.shape
+        count, width, size = factor.upper.shape
         one, other = factor.halves(adjoint), factor.halves(x.conj())
         of_matrix = one.new_zeros(count + width, 2 * width + 1, size)
         for d in range(-min(width, count - 1), min(width, count - 1) + 1):
@@ -281,4 +252,4 @@ class InterpolatedFactors:
         one = torch.ones_like(rising[:1])
         hat = torch.minimum(torch.cat([one, rising]), torch.cat([1 - rising, one])).clamp(min=0)  # (nodes, S)
         tensors = ((values[..., near] @ hat.to(values)).flatten(-2) for values in self.tensors)
-        return BandedFactor.of_tensors(*tensors)
+        return BandedFactor(*tensors)
