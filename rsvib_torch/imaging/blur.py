@@ -58,13 +58,6 @@ class RowPSF:
         return torch.stack([x, y], dim=-1) + self.first_tap
 
 
-def _axis_weights(displacement: Tensor, degree: int) -> tuple[Tensor, Tensor]:
-    """First tap (..., R) and spline weights (..., R, N, K) of displacements (..., R, N) along one axis."""
-    cell = displacement.detach().floor()
-    first, weights = spread_taps(cell, bspline_weights(displacement - cell, degree))
-    return first - degree // 2, weights
-
-
 def _check_memory(displacement: Tensor, degree: int) -> None:
     """Raise a ``ValueError`` unless the kernels fit into the free memory; a GPU raises an error of its own."""
     if displacement.device.type != "cpu":
@@ -126,10 +119,10 @@ def trajectory_psf(displacement: Tensor, node_weights: Tensor, *, interpolation:
     check_choice("interpolation", interpolation, tuple(SPLINE_DEGREES))
     degree = SPLINE_DEGREES[interpolation]
     _check_memory(displacement.detach(), degree)
-    first_x, weights_x = _axis_weights(displacement[..., 0], degree)
-    first_y, weights_y = _axis_weights(displacement[..., 1], degree)
-    weights = (weights_y * node_weights[:, None]).transpose(-2, -1) @ weights_x
-    return RowPSF(torch.stack([first_x, first_y], dim=-1), weights, degree)
+    interpolate = partial(bspline_weights, degree=degree)
+    first_x, taps_x = row_taps(displacement[..., 0], torch.ones_like(node_weights), interpolate)
+    first_y, taps_y = row_taps(displacement[..., 1], node_weights, interpolate)
+    return RowPSF(torch.stack([first_x, first_y], dim=-1) - degree // 2, taps_y @ taps_x.mT, degree)
 
 
 def row_taps(places: Tensor, node_weights: Tensor, interpolate: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:

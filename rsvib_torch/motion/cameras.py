@@ -105,22 +105,23 @@ class CameraMode:
 def _modes() -> tuple[CameraMode, ...]:
     """All modes of the table, in the order of brand, model, and size."""
     text = (files("rsvib_torch") / "motion" / "readout_times.csv").read_text(encoding="utf-8")
-    rows = csv.DictReader(line for line in text.splitlines() if not line.startswith("#"))
+    lines = csv.reader(line for line in text.splitlines() if not line.startswith("#"))
+    next(lines)  # names of the columns
     return tuple(
         CameraMode(
-            brand=row["brand"],
-            model=row["model"],
-            lens=row["lens"],
-            width=int(row["width"]),
-            height=int(row["height"]),
-            frame_rate=float(row["frame_rate"]),
-            readout_time=1e-3 * float(row["readout_ms"]),
-            readout_time_std=1e-3 * float(row["spread_ms"]),
-            calibrations=int(row["entries"]),
-            readout_direction=row["direction"],
-            measured_rows=int(row["height"]),
+            brand=brand,
+            model=model,
+            lens=lens,
+            width=int(width),
+            height=int(height),
+            frame_rate=float(rate),
+            readout_time=1e-3 * float(readout_ms),
+            readout_time_std=1e-3 * float(spread_ms),
+            calibrations=int(entries),
+            readout_direction=direction,
+            measured_rows=int(height),
         )
-        for row in rows
+        for brand, model, lens, width, height, rate, readout_ms, spread_ms, entries, direction in lines
     )
 
 

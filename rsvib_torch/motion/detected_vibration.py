@@ -70,8 +70,8 @@ class DetectedVibration(
 
     def summary(self) -> str:
         """Tones of each axis with standard deviations, then the verdict; of a batch, a table with one row per axis."""
-        rows = [cells for _, cells in tone_rows(self.vibration, self.std, hidden=self.std_if_hidden_tone)]
-        head = tone_head(axes=self.vibration.num_axes)
+        rows = tone_rows(self.vibration, self.std, self.std_if_hidden_tone)
+        head = tone_head(self.vibration.num_axes)
         table, *verdict = verdict_table(head, rows, self.batch_shape, self.reliable, self.reasons)
         if not self.batch_shape:
             verdict += [wrapped(f"assumed: {text}") for text in self.assumptions]

@@ -46,9 +46,9 @@ class Motion(Result, ABC):
         """Leading dimensions: empty for one motion, (B,) for a batch of stacks."""
 
     @property
-    @abstractmethod
     def device(self) -> torch.device:
         """Device of the parameters."""
+        return next(value.device for value in vars(self).values() if isinstance(value, Tensor))
 
     @abstractmethod
     def displacement(self, times: Tensor) -> Tensor:
@@ -227,11 +227,6 @@ class ColumnMotion(Motion):
     def batch_shape(self) -> torch.Size:
         """Leading dimensions: (B,)."""
         return self.components.batch_shape
-
-    @property
-    def device(self) -> torch.device:
-        """Device of the parameters."""
-        return self.components.device
 
     @property
     def num_axes(self) -> int:

@@ -187,11 +187,6 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         return self.coefficients.shape[:-2]
 
     @property
-    def device(self) -> torch.device:
-        """Device of the parameters."""
-        return self.coefficients.device
-
-    @property
     def end(self) -> float:
         """Time of the last knot in seconds."""
         return self.start + (self.coefficients.shape[-1] - 3) * self.spacing

@@ -261,13 +261,7 @@ class SensorTiming:
 
     def in_row_order(self) -> RowTiming:
         """The same timing for frames already turned to row order (rows on axis -2, first row read first)."""
-        return RowTiming(
-            self.row_time,
-            self.exposure_rows,
-            self.frame_rows,
-            frame_start_times=self.frame_start_times,
-            row_time_std=self.row_time_std,
-        )
+        return RowTiming(**(vars(self) | {"scan_axis": -2, "readout_direction": "forward"}))
 
 
 @options

@@ -28,7 +28,6 @@ _UNITS = {
     "image_acceleration": "px/s^2; of roll rad/s^2, of zoom 1/s^2",
     "image_shift": "px; of roll rad, of zoom 1",
 }
-_COLUMNS = {"amplitude": ("px", 1.0), "frequency": ("Hz", 1.0), "period": ("ms", 1e3), "phase": ("rad", 1.0)}
 _QUANTITIES = ("amplitude", "frequency", "phase")
 _POLYNOMIAL = ("image_motion", "image_acceleration", "image_shift")
 
@@ -264,19 +263,13 @@ class Vibration(
 
     def summary(self) -> str:
         """The tones of each axis as a table."""
-        rows = [cells for _, cells in tone_rows(self)]
-        table = text_table([*axis_head(self.batch_shape), *tone_head(axes=self.num_axes)], rows)
+        table = text_table([*axis_head(self.batch_shape), *tone_head(self.num_axes)], tone_rows(self))
         return "\n".join([table, *image_motion_line(self)])
 
     @property
     def batch_shape(self) -> torch.Size:
         """Leading dimensions: empty for one vibration, (B,) for a batch of stacks."""
         return self.amplitude.shape[:-2]
-
-    @property
-    def device(self) -> torch.device:
-        """Device of the parameters."""
-        return self.amplitude.device
 
     @property
     def num_axes(self) -> int:
@@ -415,7 +408,7 @@ class VibrationStd(
             [*labels, *(measured_text(getattr(self, name)[at], digits=2) for name in _QUANTITIES)]
             for at, labels in tone_places(self)
         ]
-        head = [*axis_head(self.batch_shape), *tone_head(axes=self.amplitude.shape[-2])]
+        head = [*axis_head(self.batch_shape), *tone_head(self.amplitude.shape[-2])]
         return "standard deviations\n" + text_table(head, rows)
 
     def from_row_order(self, timing: SensorTiming) -> "VibrationStd":
@@ -434,38 +427,30 @@ def tone_places(values: Vibration | VibrationStd) -> list[tuple[tuple[int, ...],
     return [(at, labels) for at, labels in rows if at[-1] == 0 or float(values.amplitude[at]) > 0]
 
 
-def tone_head(quantities: Sequence[str] = _QUANTITIES, axes: int = 2) -> list[str]:
+def tone_head(axes: int) -> list[str]:
     """Heads of the columns of ``tone_rows`` behind the axis, for motions with this number of axes."""
-    units = {name: unit for name, (unit, _) in _COLUMNS.items()}
-    units["amplitude"] = ("px", "px; roll: rad", "px; roll: rad; zoom: 1")[axes - 2]
-    return [f"{name} ({units[name]})" for name in quantities]
+    unit = ("px", "px; roll: rad", "px; roll: rad; zoom: 1")[axes - 2]
+    return [f"amplitude ({unit})", "frequency (Hz)", "phase (rad)"]
 
 
 def tone_rows(
-    vibration: Vibration,
-    std: VibrationStd | None = None,
-    quantities: Sequence[str] = _QUANTITIES,
-    hidden: VibrationStd | None = None,
-) -> list[tuple[tuple[int, ...], list[str]]]:
-    """Rows of a table of tones: the index (..., axis, tone) in the tensors, and the cells of the ``quantities``.
+    vibration: Vibration, std: VibrationStd | None = None, hidden: VibrationStd | None = None
+) -> list[list[str]]:
+    """Rows of a table of tones.
 
     Standard deviations if a further tone is ``hidden`` are added where they are larger, but for phases: a line of a
     terminal has 80 characters.
     """
-    rows = []
-    for at, labels in tone_places(vibration):
-        cells = ["no tone"] + [""] * (len(quantities) - 1)
-        if float(vibration.amplitude[at]) > 0:
-            cells = [
-                measured_text(
-                    scale * getattr(vibration, name)[at],
-                    None if std is None else scale * getattr(std, name)[at],
-                    hidden=None if hidden is None or name == "phase" else scale * getattr(hidden, name)[at],
-                )
-                for name, scale in ((name, _COLUMNS[name][1]) for name in quantities)
-            ]
-        rows.append((at, labels + cells))
-    return rows
+
+    def cell(name: str, at: tuple[int, ...]) -> str:
+        uncertainty = None if std is None else getattr(std, name)[at]
+        if_hidden = None if hidden is None or name == "phase" else getattr(hidden, name)[at]
+        return measured_text(getattr(vibration, name)[at], uncertainty, hidden=if_hidden)
+
+    return [
+        [*labels, *([cell(name, at) for name in _QUANTITIES] if vibration.amplitude[at] > 0 else ["no tone", "", ""])]
+        for at, labels in tone_places(vibration)
+    ]
 
 
 def image_motion_line(vibration: Vibration, std: VibrationStd | None = None) -> list[str]:

@@ -85,7 +85,7 @@ class BandedFactor:
     # times as much to rounding
     middle: Tensor
     middle_inverse: Tensor
-    _memories: dict[int, _Memory] = field(default_factory=dict)
+    _memories: dict[int, _Memory] = field(default_factory=dict, init=False)
 
     @property
     def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:

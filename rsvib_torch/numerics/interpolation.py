@@ -97,9 +97,10 @@ def _prefilter_taps(degree: int, double: bool) -> tuple[float, ...]:
     return _PREFILTERS[degree, double]
 
 
-def _symmetric(taps: tuple[float, ...], like: Tensor) -> Tensor:
-    """A symmetric kernel from its taps 0, 1, 2 ..."""
-    return torch.tensor(taps[:0:-1] + taps, dtype=like.dtype, device=like.device)
+def _prefilter(degree: int, samples: Tensor) -> Tensor:
+    """The inverse filter (1, N) in the dtype of the samples."""
+    taps = _prefilter_taps(degree, samples.dtype in (torch.float64, torch.complex128))
+    return torch.tensor(taps[:0:-1] + taps, dtype=samples.dtype, device=samples.device)[None]
 
 
 def mirrored(index: Tensor, length: int) -> Tensor:
@@ -116,25 +117,14 @@ def mirrored(index: Tensor, length: int) -> Tensor:
 
 def bspline_coefficient_rows(samples: Tensor, degree: int) -> Iterator[tuple[slice, Tensor]]:
     """``bspline_coefficients`` across the rows of images, in slices of rows that stay in the cache."""
-    on_cpu = samples.device.type == "cpu"
-    if samples.numel() <= (1 << 20 if on_cpu else 1 << 24):  # fits the cache, or the memory
-        yield slice(0, samples.shape[-2]), bspline_coefficients(samples, degree, -2)
-        return
-    taps = _prefilter_taps(degree, samples.dtype in (torch.float64, torch.complex128))
-    reach, height = len(taps) - 1, samples.shape[-2]
+    on_cpu, height = samples.device.type == "cpu", samples.shape[-2]
+    fits = samples.numel() <= (1 << 20 if on_cpu else 1 << 24)  # the cache, or the memory
+    kernel = _prefilter(degree, samples)
+    reach = kernel.shape[-1] // 2
     index = mirrored(torch.arange(-reach, height + reach, device=samples.device), height)
-    step = min(64 if on_cpu else 256, height)
-    matrix = _toeplitz(_symmetric(taps, samples), step)
-    for rows in runs(height, step):
-        count = rows.stop - rows.start
-        near = slice(rows.start - reach, rows.stop + reach)
-        inside = near.start >= 0 and near.stop <= height
-        source = (
-            samples[..., near, :] if inside else samples.index_select(-2, index[rows.start : rows.stop + 2 * reach])
-        )
-        flat = source.flatten(0, -3)
-        own = matrix[:count, : count + 2 * reach].expand(len(flat), -1, -1)
-        yield rows, torch.bmm(own, flat).view(*samples.shape[:-2], count, -1)
+    for rows in runs(height, height if fits else 64 if on_cpu else 256):
+        near = samples.index_select(-2, index[rows.start : rows.stop + 2 * reach])
+        yield rows, correlated(near, kernel, -2)[0]
 
 
 def bspline_coefficients(samples: Tensor, degree: int, dim: int) -> Tensor:
@@ -145,10 +135,10 @@ def bspline_coefficients(samples: Tensor, degree: int, dim: int) -> Tensor:
     """
     if degree == 1:
         return samples
-    taps = _prefilter_taps(degree, samples.dtype in (torch.float64, torch.complex128))
-    length, reach = samples.shape[dim], len(taps) - 1
+    kernel, length = _prefilter(degree, samples), samples.shape[dim]
+    reach = kernel.shape[-1] // 2
     index = mirrored(torch.arange(-reach, length + reach, device=samples.device), length)
-    return correlated(samples.index_select(dim, index), _symmetric(taps, samples)[None], dim)[0]
+    return correlated(samples.index_select(dim, index), kernel, dim)[0]
 
 
 def bspline_coefficients_adjoint(values: Tensor, degree: int, dim: int) -> Tensor:
@@ -172,40 +162,25 @@ def correlated(samples: Tensor, kernels: Tensor, dim: int, step: int = 1) -> Ten
     step + 1`` entries along ``dim``.
     """
     if samples.ndim == 1:
-        return correlated(samples[None], kernels, 1, step)[:, 0]
+        return correlated(samples[:, None], kernels, 0, step)[..., 0]
     number, taps = kernels.shape
-    length = (samples.shape[dim] - taps) // step + 1
-    if dim not in (-1, samples.ndim - 1):
-        values = _across(samples.movedim(dim, -2), kernels, step, length)
-        return values.movedim(-2, dim + 1 if dim >= 0 else dim)
-    block = min(64 if samples.device.type == "cpu" else 256, length)  # values per matrix product
-    matrix = _toeplitz(kernels, block, step)  # (Q, block, m)
-    parts = []
-    for part in runs(length, block):
-        count = part.stop - part.start
-        own = matrix[:, :count, : (count - 1) * step + taps].flatten(0, 1)
-        values = samples[..., part.start * step : (part.stop - 1) * step + taps] @ own.T
-        parts.append(values.unflatten(-1, (number, count)))
-    return torch.cat(parts, -1).movedim(-2, 0)
-
-
-def _across(samples: Tensor, kernels: Tensor, step: int, length: int) -> Tensor:
-    """``correlated`` across rows (..., n, W): (Q, ..., length, W), by batches of small matrices."""
-    number, taps = kernels.shape
-    block = min(32 // step if samples.device.type == "cpu" else 256, length)
-    span = (block - 1) * step + taps
-    count = length // block
-    matrix = _toeplitz(kernels, block, step)  # (Q, block, span)
-    windows = samples.unfold(-2, span, block * step).mT  # (..., count, span, W)
+    rows = samples.movedim(dim, -2)
+    length = (rows.shape[-2] - taps) // step + 1
+    # 1. Blocks of values, by a batch of products with one matrix (Q, block, span).
+    block = min(max(1, 32 // step) if samples.device.type == "cpu" else 256, length)
+    span, count = (block - 1) * step + taps, length // block
+    matrix = _toeplitz(kernels, block, step)
+    windows = rows.unfold(-2, span, block * step).mT  # (..., count, span, W)
     every = windows.reshape(-1, *windows.shape[-2:])
     products = torch.bmm(matrix.reshape(1, -1, span).expand(len(every), -1, -1), every)
-    blocks: Tensor = products.view(*windows.shape[:-2], number, block, -1).movedim(-3, 0).flatten(-3, -2)
+    values: Tensor = products.view(*windows.shape[:-2], number, block, -1).movedim(-3, 0).flatten(-3, -2)
+    # 2. The values behind the last whole block.
     rest = length - count * block
-    if not rest:
-        return blocks
-    near = (rest - 1) * step + taps
-    last = matrix[:, :rest, :near].flatten(0, 1) @ samples[..., count * block * step :, :][..., :near, :]
-    return torch.cat([blocks, last.unflatten(-2, (number, rest)).movedim(-3, 0)], -2)
+    if rest:
+        near = (rest - 1) * step + taps
+        last = matrix[:, :rest, :near].flatten(0, 1) @ rows[..., count * block * step :, :][..., :near, :]
+        values = torch.cat([values, last.unflatten(-2, (number, rest)).movedim(-3, 0)], -2)
+    return values.movedim(-2, dim + 1 if dim >= 0 else dim)
 
 
 @cache
