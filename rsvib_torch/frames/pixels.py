@@ -111,16 +111,8 @@ def cut_parts(images: Tensor, tops: Sequence[int], lefts: Sequence[int], size: t
         [0, 11]
     """
     height, width = size
-    if len({*zip(tops, lefts, strict=True)}) == 1:
-        return images[..., tops[0] : tops[0] + height, lefts[0] : lefts[0] + width]
-    flat = images.flatten(1, -3) if images.ndim > 3 else images[:, None]
-    stack, plane = (torch.arange(extent, device=images.device) for extent in flat.shape[:2])
-    first = torch.tensor([tops, lefts], device=images.device)[..., None]
-    rows, columns = (
-        start + torch.arange(extent, device=images.device) for start, extent in zip(first, size, strict=True)
-    )
-    parts = flat[stack[:, None, None, None], plane[:, None, None], rows[:, None, :, None], columns[:, None, None]]
-    return parts.view(*images.shape[:-2], height, width)
+    places = zip(images, tops, lefts, strict=True)
+    return torch.stack([image[..., top : top + height, left : left + width] for image, top, left in places])
 
 
 _LUMINANCE = (0.25, 0.5, 0.25)  # shares of red, green and blue in a mosaic

@@ -307,14 +307,8 @@ def _compared(warp: Callable[[slice], Tensor], runs: list[slice], visible: Tenso
 
     def of_run(rows: slice) -> tuple[Tensor, Tensor, Tensor]:
         warped, part_visible = warp(rows), visible[:, :, rows]
-        different = differences(warped, part_visible)
-        # half the difference of two frames has the noise of their mean
-        noise = (
-            different[:, 0, :, ::_NOISE_STEP]
-            if warped.shape[1] == 2
-            else _noise_of_mean(warped[..., ::_NOISE_STEP], part_visible)
-        )
-        return mean_over_frames(warped, part_visible), noise, different
+        noise = _noise_of_mean(warped[..., ::_NOISE_STEP], part_visible)
+        return mean_over_frames(warped, part_visible), noise, differences(warped, part_visible)
 
     means, noises, different = zip(*in_parallel(of_run, runs, visible.device), strict=True)
     missing = fast_length(visible.shape[2]) - visible.shape[2]

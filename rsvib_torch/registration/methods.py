@@ -324,16 +324,11 @@ def _phase_surface(first: Tensor, second: Tensor, fraction: Tensor) -> Tensor:
     high = (u > 0.4)[None] & (v.abs() > 0.25)[:, None]  # cycles/px: noise only, after the Gaussian of 1 px
     noise = (magnitude * high).sum((-2, -1), keepdim=True) / high.sum()
     low_pass = torch.exp(-(v[:, None].square() + u.square()) / (2 * 0.15**2))
-    twice = torch.full_like(u, 2.0)  # rfft stores one half of the spectrum
-    twice[0] = 1.0
-    if width % 2 == 0:
-        twice[-1] = 1.0
-    weight = low_pass * twice / (magnitude + 10.0 * noise + torch.finfo(first.dtype).tiny)
-    full = (magnitude * weight).sum((-2, -1))
-    lags = torch.arange(-LAGS, LAGS + 1, dtype=first.dtype, device=first.device)
-    transforms = [torch.exp(2j * torch.pi * lags[:, None] * frequency) for frequency in (v, u)]
-    surface = (transforms[0] @ ((cross * weight) @ transforms[1].T)).real
-    return (surface / full.clamp(min=torch.finfo(first.dtype).tiny)[:, None, None]).unflatten(0, shape)
+    weight = low_pass / (magnitude + 10.0 * noise + torch.finfo(first.dtype).tiny)
+    surface, aligned = (torch.fft.irfft2(values * weight, s=(height, width)) for values in (cross, magnitude))
+    lags = torch.arange(-LAGS, LAGS + 1, device=first.device)
+    largest = aligned[:, :1, :1].clamp(min=torch.finfo(first.dtype).tiny)
+    return (surface[:, lags[:, None], lags] / largest).unflatten(0, shape)
 
 
 # Gray projection (Sec. 2.2 of Liu et al. 2023)
