@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import ArrayLike, as_tensor, channels_appear_last, check_pixels, checks_arguments
+from rsvib_torch.checks.validation import Count
 from rsvib_torch.checks.values import check_single
 from rsvib_torch.files.free_memory import check_fits
 from rsvib_torch.frames.prepare import frames_from_row_order, frames_to_row_order
@@ -32,7 +33,7 @@ def simulate_frames(
     scene: ArrayLike,
     timing: SensorTiming,
     vibration: Motion,
-    num_frames: int = 2,
+    num_frames: Count = 2,
     *,
     frame_size: tuple[int, int] | None = None,
     noise: SensorNoise | None = None,
@@ -84,10 +85,6 @@ def simulate_frames(
         raise ValueError(
             f"scene of shape {tuple(scene.shape)} appears to have its channels last: pass scene.permute(2, 0, 1)"
         )
-    if noise is not None and not isinstance(noise, SensorNoise):
-        raise TypeError(f"noise must be a SensorNoise, got {type(noise).__name__}")
-    if num_frames < 1:
-        raise ValueError(f"num_frames must be at least 1, got {num_frames}")
     check_single("vibration", vibration.batch_shape)
     height, width = map(min, frame_size or scene.shape[-2:], scene.shape[-2:])
     row_bytes = 400 * min(height, _CHUNK_ROWS) + 12 * height  # per column: spectra of a chunk, frames; measured
