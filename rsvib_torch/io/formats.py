@@ -3,10 +3,10 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
+from rsvib_torch.files.atomic import Kind
 from rsvib_torch.files.reading import check_regular
-from rsvib_torch.io.array_stores import open_hdf5, open_npy, open_zarr, write_hdf5, write_npy, write_zarr
+from rsvib_torch.io.array_stores import open_hdf5, open_npy, write_hdf5, write_npy
 from rsvib_torch.io.frame_reader import FrameReader
 from rsvib_torch.io.images import check_images, open_images, write_images
 from rsvib_torch.io.stack_info import FFV1, H264, READ_ONLY_VIDEO, StackInfo
@@ -30,8 +30,7 @@ class StackFormat:
         "uint8", "int8", "uint16", "int16", "uint32", "int32", "float16", "float32", "float64",
     )  # fmt: skip
     check: Callable[[Path, StackInfo], None] | None = None  # raises an error if a stack cannot be written to a path
-    kind: Literal["file", "folder", "tree"] = "file"  # a "folder" may contain other files; a "tree" is replaced as one
-    marker: str = ""  # file that identifies a folder of any name as a stack of this format
+    kind: Kind = "file"  # a "folder" may contain other files
     compressions: tuple[str, ...] = ()  # values of ``compression`` besides None
     keeps: tuple[str, ...] = ()  # attributes of ``StackInfo`` that are stored besides the pixels
 
@@ -54,25 +53,17 @@ _STACK_FORMATS = (
     StackFormat("FFV1 video", FFV1, VideoReader, write_video, ("uint8", "uint16"), check_video, keeps=_KEPT),
     StackFormat("H.264 video", H264, VideoReader, write_video, check=check_video, keeps=_KEPT),
     StackFormat("avi, webm, mpeg, 3gp and wmv", READ_ONLY_VIDEO, VideoReader),
-    StackFormat(
-        "zarr", (".zarr",), open_zarr, write_zarr, check=check_array, kind="tree", marker="zarr.json", keeps=_KEPT
-    ),
 )
 FORMATS: dict[str, StackFormat] = {ending: form for form in _STACK_FORMATS for ending in form.endings}
 """Format of every file ending."""
 
 
 def find_format(path: Path) -> StackFormat:
-    """The format of an existing stack: by its ending, of a folder also by its marker file, else a folder of images."""
+    """The format of an existing stack: by its ending, or a folder of images."""
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist")
     check_regular(path)
-    if not path.is_dir():
-        return target_format(path)
-    by_ending = FORMATS.get(path.suffix.lower())
-    if by_ending is not None and by_ending.kind != "file":
-        return by_ending
-    return next((form for form in FORMATS.values() if form.marker and (path / form.marker).is_file()), FORMATS[""])
+    return FORMATS[""] if path.is_dir() else target_format(path)
 
 
 def target_format(path: Path) -> StackFormat:

@@ -64,7 +64,7 @@ def _open_image(path: Path) -> FrameReader:
         stated = image.info.get(_FULL_SCALE)
         full_scale = known_full_scale(dtype, None if stated is None else float(stated))
         info = StackInfo(shape, dtype.name, full_scale, **exif_fields(image.info.get("exif", b"")))
-    return FrameReader(path, info, lambda *_: _decoded(path, is_png).reshape(info.shape))
+    return FrameReader(path, info, lambda _: _decoded(path, is_png))
 
 
 def _decoded(path: Path, is_png: bool) -> Array:
@@ -152,11 +152,11 @@ def open_images(path: Path) -> FrameReader:
     if path.is_dir() and files[0].suffix.lower() in _TIFF:
         stack = replace(stack, files=tuple(files))
 
-    def read(index: int, _: int) -> Array:
+    def read(index: int) -> Array:
         if files[index] in damaged:
             raise FrameError(str(damaged[files[index]]))
         with closing(_open_image(files[index])) as reader:
-            return reader.frame(0).reshape(1, *stack.shape[1:])
+            return reader.frame(0)
 
     return FrameReader(path, stack, read)
 

@@ -41,10 +41,8 @@ def check_info_target(
         form.check(path, info)
     if info.is_integer:
         required_full_scale(info.full_scale, np.dtype(info.dtype), path)
-    if form.kind == "tree" and path.exists() and not (path / form.marker).is_file():  # all its files are replaced
-        raise FileExistsError(f"cannot write {path}: it exists and is not a {form.name} stack; choose another name")
     if check_folder:
-        check_writable(path, folder=form.kind != "file")
+        check_writable(path, folder=form.kind == "folder")
     return form
 
 

@@ -226,12 +226,12 @@ class VideoReader(FrameReader):
 
     def __init__(self, path: Path) -> None:
         info, self._times, self.picture = scanned(path)
-        super().__init__(path, info, lambda index, _: _pixels(self._decoded(index))[None])
+        super().__init__(path, info, lambda index: _pixels(self._decoded(index)))
         self._next, self._presented = 0, self._in_order()
 
     def _in_order(self) -> Generator[av.VideoFrame | None, None, None]:
         """The frames in their order, each at its presentation time if they are known; None if it cannot be decoded."""
-        with open_container(self._path) as container, closing(_frames(container)) as decoded:
+        with open_container(self.path) as container, closing(_frames(container)) as decoded:
             frame = next(decoded, None)
             for expected in self._times or repeat(None, self.info.shape[0]):
                 time = None if frame is None or expected is None else _seconds(frame.pts, frame.time_base)
@@ -259,11 +259,11 @@ class VideoReader(FrameReader):
         frame = next(islice(self._presented, index - self._next, None), None)
         self._next = index + 1
         if frame is None:
-            raise FrameError(f"{self._path}: frame {index} cannot be decoded")
+            raise FrameError(f"{self.path}: frame {index} cannot be decoded")
         if frame.is_corrupt:
-            raise FrameError(f"{self._path}: frame {index} is damaged")
+            raise FrameError(f"{self.path}: frame {index} is damaged")
         if (frame.height, frame.width) != self.info.shape[-2:]:
-            raise FrameError(f"{self._path}: frames of different size: frame {index} is {frame.height, frame.width}")
+            raise FrameError(f"{self.path}: frames of different size: frame {index} is {frame.height, frame.width}")
         return frame
 
     def close(self) -> None:
