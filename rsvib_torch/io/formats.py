@@ -1,6 +1,6 @@
 """The table of stack formats, and the choice of a format by the ending of a file name."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,13 +63,20 @@ def find_format(path: Path) -> StackFormat:
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist")
     check_regular(path)
-    return FORMATS[""] if path.is_dir() else target_format(path)
+    return FORMATS[""] if path.is_dir() else _format_of_ending(path, FORMATS, "a folder of PNG, TIFF or JPEG files")
 
 
 def target_format(path: Path) -> StackFormat:
     """The format in which a path is written, by its ending only."""
-    if path.suffix.lower() in FORMATS:
-        return FORMATS[path.suffix.lower()]
-    known = ", ".join(ending for ending in FORMATS if ending)
-    known += " or a folder of PNG, TIFF or JPEG files"
-    raise ValueError(f"{path}: unknown file ending {quoted(path.suffix)}; expected {known}")
+    written = {ending: form for ending, form in FORMATS.items() if form.write is not None}
+    return _format_of_ending(path, written, "a name without an ending for a folder of PNG files")
+
+
+def _format_of_ending(path: Path, formats: Mapping[str, StackFormat], folder: str) -> StackFormat:
+    ending = path.suffix.lower()
+    if ending in formats:
+        return formats[ending]
+    read_only = f"{FORMATS[ending].name} files can only be read" if ending in FORMATS else ""
+    known = ", ".join(known for known in formats if known)
+    problem = read_only or f"unknown file ending {quoted(path.suffix)}"
+    raise ValueError(f"{path}: {problem}; expected {known} or {folder}")

@@ -28,9 +28,6 @@ def check_info_target(
     """The format in which ``path`` is written, or the error of writing; ``check_folder``: its folder must exist."""
     form = target_format(path)
     check_target(path, form.kind, parent_exists=False)
-    if form.write is None:
-        remedy = "write .tif, .png, .npy, .mkv or a folder of PNG files"
-        raise ValueError(f"{path}: {form.name} files can only be read; {remedy}")
     if info.dtype not in form.dtypes:
         raise ValueError(f"{path}: {form.name} files hold {', '.join(form.dtypes)}; got dtype {info.dtype}")
     if compression is not None:
