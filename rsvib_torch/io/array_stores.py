@@ -16,8 +16,7 @@ import numpy as np
 
 from rsvib_torch.checks.values import needed_package
 from rsvib_torch.io.frame_reader import FrameReader, contiguous_reader, readable_stack
-from rsvib_torch.io.stack_info import StackInfo
-from rsvib_torch.io.stated_metadata import attributes_of, info_of_array
+from rsvib_torch.io.stack_info import StackInfo, attributes_of, info_of_array
 from rsvib_torch.numerics.tables import Array
 
 if TYPE_CHECKING:

@@ -9,8 +9,7 @@ from rsvib_torch.files.reading import check_regular
 from rsvib_torch.io.array_stores import open_hdf5, open_npy, write_hdf5, write_npy
 from rsvib_torch.io.frame_reader import FrameReader
 from rsvib_torch.io.images import check_images, open_images, write_images
-from rsvib_torch.io.stack_info import FFV1, H264, READ_ONLY_VIDEO, StackInfo
-from rsvib_torch.io.stated_metadata import check_array
+from rsvib_torch.io.stack_info import FFV1, H264, READ_ONLY_VIDEO, StackInfo, check_array
 from rsvib_torch.io.tiff import open_tiff, write_tiff
 from rsvib_torch.io.video import VideoReader, check_video, write_video
 from rsvib_torch.numerics.tables import Array

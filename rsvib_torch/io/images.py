@@ -20,8 +20,7 @@ from PIL.PngImagePlugin import PngImageFile, putchunk
 from rsvib_torch.files.reading import Table
 from rsvib_torch.io.frame_reader import FrameError, FrameReader, readable_stack
 from rsvib_torch.io.full_scale import known_full_scale
-from rsvib_torch.io.stack_info import DIFFERENT, StackInfo, Tag
-from rsvib_torch.io.stated_metadata import exif_fields
+from rsvib_torch.io.stack_info import DIFFERENT, StackInfo, Tag, exif_fields
 from rsvib_torch.io.tiff import open_tiff, storage_of, write_tiff
 from rsvib_torch.numerics.tables import Array
 

@@ -22,8 +22,7 @@ import numpy as np
 from rsvib_torch.checks.values import needed_package
 from rsvib_torch.files.free_memory import check_fits
 from rsvib_torch.io.frame_reader import FrameError, FrameReader, readable_stack
-from rsvib_torch.io.stack_info import H264, VIDEO, StackInfo
-from rsvib_torch.io.stated_metadata import camera_name
+from rsvib_torch.io.stack_info import H264, VIDEO, StackInfo, camera_name
 from rsvib_torch.numerics.tables import Array
 
 if TYPE_CHECKING:
