@@ -13,7 +13,7 @@ LAYERS: tuple[dict[str, str], ...] = (
     {"stacks": "process.py: windows, jobs, memory planning; run_folder.py: a run to a file, and how it resumes"},
     {"io": "stack_reading.py, stack_writing.py, formats.py (table of formats), one module per format"},
     {
-        "evaluation": "image quality, slanted edge (mtf/), Cramér–Rao bound",
+        "evaluation": "image quality, MTF of a slanted edge (slanted_edge.py), Cramér–Rao bound",
         "row_time": "row time of a camera from flickering light or motion",
         "augmentation": "training data for Kornia pipelines",
         "datasets": "drawn scenes and example frames",
@@ -55,7 +55,7 @@ INNER_LAYERS: dict[str, tuple[set[str], ...]] = {
         {"shapes"},
         {"detect"},
     ),
-    "evaluation": ({"quality", "mtf", "bound"},),
+    "evaluation": ({"quality", "edge_fit", "bound"}, {"edge_spread"}, {"slanted_edge"}),
     "report": ({"results", "plots"}, {"page"}),
     "restoration": (
         {"frame_motion", "observation", "restoration_verdict"},

@@ -32,7 +32,7 @@ def test_outcomes(tmp_path):
 STARTS = ("npy: shape (1000", "npy: header", "npy: 10^8", "pipe .", "device .")
 STARTS += ("PNG: 2147", "PNG: sparse", "JPEG: sparse")
 STARTS += ("TIFF: width", "TIFF: the next page is", "TIFF: 20000 pages", "HDF5: 25", "HDF5: no", "HDF5: external")
-STARTS += ("HDF5: virtual", "Zarr: shape (4", "Zarr: 10^9", "Zarr: chunk is a", "Zarr: unknown codec")
+STARTS += ("HDF5: virtual",)
 STARTS += ("video: playlist", "video: list", "CSV: field", "TOML: nested", "TOML: 64", "vibration: nested")
 
 

@@ -17,7 +17,7 @@ from rsvib_torch.restoration.priors import PRIORS
 from rsvib_torch.restoration.restore import METHODS
 
 PACKAGE = Path(rsv.__file__).parent
-LIBRARIES = ("kornia", "cv2", "scipy", "tifffile", "h5py", "zarr", "matplotlib", "jinja2", "imagecodecs")
+LIBRARIES = ("kornia", "cv2", "scipy", "tifffile", "h5py", "matplotlib", "jinja2", "imagecodecs")
 PROGRAM = ("torch", "numpy", *LIBRARIES)
 BAD_CONFIG = """
 [sensor]

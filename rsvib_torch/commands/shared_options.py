@@ -152,7 +152,7 @@ class StackCommand(CameraOptions, DeviceOptions):
     """A command that reads a stack of frames."""
 
     frames: Path = argument()
-    """Stack of frames: TIFF, .npy, HDF5, Zarr, video, or a folder of PNG, TIFF or JPEG files. NAME[100:200] are
+    """Stack of frames: TIFF, .npy, HDF5, video, or a folder of PNG, TIFF or JPEG files. NAME[100:200] are
     its frames 100 to 199, from the first of which times count."""
 
     @cached_property

@@ -1,4 +1,4 @@
-"""A landscape from above: towns with small buildings, fields, woods, roads and a river."""
+"""A landscape from above: towns with small buildings, fields, woods, roads and a river; and frames made from it."""
 
 import math
 from dataclasses import dataclass
@@ -11,6 +11,9 @@ from torch.nn import functional
 
 from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.datasets.drawing import FLOAT, Blur, Size, edge, fractal_texture, rectangle, rotated, smoothed
+from rsvib_torch.imaging import simulate_frames
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.vibration import Vibration
 
 _Seed = Annotated[int, Field(ge=0)]
 _FIELDS, _TOWN, _WORKS, _WOOD = range(4)
@@ -290,3 +293,19 @@ def _draw_windows(x: Tensor, y: Tensor, plan: Tensor, sigma: float) -> Tensor:
     # the side of the roof that faces away from the light is darker
     tones = tone * (1.0 - 0.45 * gabled * torch.sin(sun - angle) * (edge(v, sigma) - 0.5))
     return torch.stack([torch.log1p(-0.62 * shadow), coverage * tones, coverage])  # 38 % of the light in a shadow
+
+
+def example_frames(num_frames: int = 2) -> tuple[Tensor, SensorTiming, Vibration]:
+    """Frames (T, H, W) of a landscape, the sensor and the vibration, for examples and first steps.
+
+    The vibration has 2.1 px at 110 Hz along x and 1.6 px at 90 Hz along y.
+
+    Example:
+        >>> frames, timing, vibration = example_frames()
+        >>> vibration.frequency[:, 0].tolist()  # Hz
+        [110.0, 90.0]
+    """
+    timing = SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+    vibration = Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
+    scene = city_and_fields(320, 240, seed=3)
+    return simulate_frames(scene, timing, vibration, num_frames=num_frames), timing, vibration

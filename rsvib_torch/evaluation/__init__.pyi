@@ -1,5 +1,5 @@
 from .bound import cramer_rao_bound
-from .mtf import MtfCurve, slanted_edge_mtf
 from .quality import psnr, ssim
+from .slanted_edge import MtfCurve, slanted_edge_mtf
 
 __all__ = ["MtfCurve", "cramer_rao_bound", "psnr", "slanted_edge_mtf", "ssim"]

@@ -21,7 +21,7 @@ from rsvib_torch.text import json_text
 
 PART = ".part"  # ending of temporary folders: .NAME.########.part
 _LONGEST_NAME = 255 - len("..12345678.part")  # bytes; of names of which temporary files have longer ones
-Kind = Literal["file", "folder", "tree"]
+Kind = Literal["file", "folder"]  # to write; a folder may contain other files
 _Path = str | os.PathLike[str]
 
 
@@ -153,8 +153,8 @@ def check_writable(path: Path, *, folder: bool = False) -> None:
 def whole(path: _Path, kind: Kind = "file") -> Iterator[Path]:
     """Write a file or folder under a temporary name; it gets its name when the block ends without an exception.
 
-    It is on the disk then. The folders above it are created. An existing file or tree is replaced; an existing folder
-    keeps its other files. The block creates what has the temporary name. ``kind`` is as in ``StackFormat``.
+    It is on the disk then. The folders above it are created. An existing file is replaced; an existing folder keeps its
+    other files. The block creates what has the temporary name. ``kind`` is as in ``StackFormat``.
     """
     target = Path(path)
     check_target(target, kind, parent_exists=False)
@@ -173,8 +173,6 @@ def whole(path: _Path, kind: Kind = "file") -> Iterator[Path]:
         for part, final in moves:
             if final.is_file():
                 part.chmod(stat.S_IMODE(final.stat().st_mode))
-            elif final.is_dir():
-                os.replace(final, folder / "old")  # is removed with the temporary folder
             os.replace(part, final)
         if kind == "folder":
             sync(target)

@@ -1,16 +1,15 @@
 """The table of stack formats, and the choice of a format by the ending of a file name."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
+from rsvib_torch.files.atomic import Kind
 from rsvib_torch.files.reading import check_regular
-from rsvib_torch.io.array_stores import open_hdf5, open_npy, open_zarr, write_hdf5, write_npy, write_zarr
+from rsvib_torch.io.array_stores import open_hdf5, open_npy, write_hdf5, write_npy
 from rsvib_torch.io.frame_reader import FrameReader
 from rsvib_torch.io.images import check_images, open_images, write_images
-from rsvib_torch.io.stack_info import FFV1, H264, READ_ONLY_VIDEO, StackInfo
-from rsvib_torch.io.stated_metadata import check_array
+from rsvib_torch.io.stack_info import FFV1, H264, READ_ONLY_VIDEO, StackInfo, check_array
 from rsvib_torch.io.tiff import open_tiff, write_tiff
 from rsvib_torch.io.video import VideoReader, check_video, write_video
 from rsvib_torch.numerics.tables import Array
@@ -30,8 +29,7 @@ class StackFormat:
         "uint8", "int8", "uint16", "int16", "uint32", "int32", "float16", "float32", "float64",
     )  # fmt: skip
     check: Callable[[Path, StackInfo], None] | None = None  # raises an error if a stack cannot be written to a path
-    kind: Literal["file", "folder", "tree"] = "file"  # a "folder" may contain other files; a "tree" is replaced as one
-    marker: str = ""  # file that identifies a folder of any name as a stack of this format
+    kind: Kind = "file"  # a "folder" may contain other files
     compressions: tuple[str, ...] = ()  # values of ``compression`` besides None
     keeps: tuple[str, ...] = ()  # attributes of ``StackInfo`` that are stored besides the pixels
 
@@ -54,31 +52,30 @@ _STACK_FORMATS = (
     StackFormat("FFV1 video", FFV1, VideoReader, write_video, ("uint8", "uint16"), check_video, keeps=_KEPT),
     StackFormat("H.264 video", H264, VideoReader, write_video, check=check_video, keeps=_KEPT),
     StackFormat("avi, webm, mpeg, 3gp and wmv", READ_ONLY_VIDEO, VideoReader),
-    StackFormat(
-        "zarr", (".zarr",), open_zarr, write_zarr, check=check_array, kind="tree", marker="zarr.json", keeps=_KEPT
-    ),
 )
 FORMATS: dict[str, StackFormat] = {ending: form for form in _STACK_FORMATS for ending in form.endings}
 """Format of every file ending."""
 
 
 def find_format(path: Path) -> StackFormat:
-    """The format of an existing stack: by its ending, of a folder also by its marker file, else a folder of images."""
+    """The format of an existing stack: by its ending, or a folder of images."""
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist")
     check_regular(path)
-    if not path.is_dir():
-        return target_format(path)
-    by_ending = FORMATS.get(path.suffix.lower())
-    if by_ending is not None and by_ending.kind != "file":
-        return by_ending
-    return next((form for form in FORMATS.values() if form.marker and (path / form.marker).is_file()), FORMATS[""])
+    return FORMATS[""] if path.is_dir() else _format_of_ending(path, FORMATS, "a folder of PNG, TIFF or JPEG files")
 
 
 def target_format(path: Path) -> StackFormat:
     """The format in which a path is written, by its ending only."""
-    if path.suffix.lower() in FORMATS:
-        return FORMATS[path.suffix.lower()]
-    known = ", ".join(ending for ending in FORMATS if ending)
-    known += " or a folder of PNG, TIFF or JPEG files"
-    raise ValueError(f"{path}: unknown file ending {quoted(path.suffix)}; expected {known}")
+    written = {ending: form for ending, form in FORMATS.items() if form.write is not None}
+    return _format_of_ending(path, written, "a name without an ending for a folder of PNG files")
+
+
+def _format_of_ending(path: Path, formats: Mapping[str, StackFormat], folder: str) -> StackFormat:
+    ending = path.suffix.lower()
+    if ending in formats:
+        return formats[ending]
+    read_only = f"{FORMATS[ending].name} files can only be read" if ending in FORMATS else ""
+    known = ", ".join(known for known in formats if known)
+    problem = read_only or f"unknown file ending {quoted(path.suffix)}"
+    raise ValueError(f"{path}: {problem}; expected {known} or {folder}")

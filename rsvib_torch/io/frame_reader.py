@@ -1,4 +1,4 @@
-"""An open stack, whose frames are read in any order, alone or, where they are stored together, in blocks."""
+"""An open stack, whose frames are read in any order."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -18,44 +18,20 @@ class FrameError(ValueError):
 
 
 class FrameReader:
-    """Frames that are read in blocks of a number of frames ``together``; a block is kept until its last frame was read.
-
-    ``read(first, last)`` returns frames ``first`` to ``last`` (exclusive), (N, H, W) or (N, C, H, W); it needs
-    ``more_bytes`` of memory besides their pixels.
-    """
+    """Frames that ``read(index)`` returns, (H, W) or (C, H, W)."""
 
     def __init__(
-        self,
-        path: Path,
-        info: StackInfo,
-        read: Callable[[int, int], Array],
-        together: int = 1,
-        more_bytes: int = 0,
-        close: Callable[[], None] = lambda: None,
+        self, path: Path, info: StackInfo, read: Callable[[int], Array], close: Callable[[], None] = lambda: None
     ) -> None:
-        self._path, self._read, self._close = path, read, close
-        self._together = min(together, info.shape[0])
-        block_bytes = self._together * info.frame_bytes if self._together > 1 else 0
-        self.info = replace(info, decoding_bytes=block_bytes + more_bytes)
-        self._first = 0
-        self._block: Array | None = None
+        self.path, self.info, self._read, self._close = path, info, read, close
 
     def frame(self, index: int) -> Array:
         """Pixels of a frame as stored: (H, W) or (C, H, W), in ``info.dtype``; ``FrameError`` if it is damaged."""
-        if self._block is None or not self._first <= index < self._first + len(self._block):
-            self._block = None  # before the next block is allocated
-            self._first = index - index % self._together
-            with readable_frame(self._path, index):
-                self._block = self._read(self._first, min(self._first + self._together, self.info.shape[0]))
-        alone = self._together == 1  # otherwise a view would keep the block in memory
-        frame = np.array(self._block[index - self._first], self.info.dtype, order="C", copy=None if alone else True)
-        if index == self._first + len(self._block) - 1:
-            self._block = None
-        return frame
+        with readable_frame(self.path, index):
+            return np.ascontiguousarray(self._read(index), self.info.dtype)
 
     def close(self) -> None:
         """Close the file, if it is open between frames."""
-        self._block = None
         self._close()
 
 
@@ -72,18 +48,18 @@ def contiguous_reader(
         raise ValueError(f"truncated: the header states {size * info.shape[0]} bytes of pixels, the file holds {held}")
     file = path.open("rb")
 
-    def read(first: int, _: int) -> Array:
-        start, pixels = offset + first * size, np.empty(0, dtype)
+    def read(index: int) -> Array:
+        start, pixels = offset + index * size, np.empty(0, dtype)
         if start + size <= os.fstat(file.fileno()).st_size:  # before memory is allocated
             file.seek(start)
             pixels = np.fromfile(file, dtype, size // dtype.itemsize)
         if pixels.nbytes < size:
-            raise FrameError(f"{path}: truncated: frame {first} lies beyond the end of the file")
+            raise FrameError(f"{path}: truncated: frame {index} lies beyond the end of the file")
         if channels_last:
-            return np.moveaxis(pixels.reshape(1, *info.shape[2:], info.shape[1]), -1, 1)
-        return pixels.reshape(1, *info.shape[1:])
+            return np.moveaxis(pixels.reshape(*info.shape[2:], info.shape[1]), -1, 0)
+        return pixels.reshape(info.shape[1:])
 
-    return FrameReader(path, info, read, close=file.close)
+    return FrameReader(path, info, read, file.close)
 
 
 def part_reader(reader: FrameReader, start: int, end: int | None) -> FrameReader:
@@ -96,20 +72,15 @@ def part_reader(reader: FrameReader, start: int, end: int | None) -> FrameReader
             f"{info.path}: frames {start}:{'' if end is None else end} of a stack of {count} frames; expected "
             f"START:END with START < END <= {count}"
         )
-    numbers = None if info.frame_numbers is None else info.frame_numbers[start:last]
     part = replace(
         info,
         shape=(last - start, *info.shape[1:]),
         frame_times=None if info.frame_times is None else info.frame_times[start:last],
-        frame_numbers=None if numbers is None else tuple(number - numbers[0] for number in numbers),
         files=None if info.files is None else info.files[start:last],
         path=None,  # the sound of a video is not that of a part
     )
 
-    def read(first: int, _: int) -> Array:
-        return reader.frame(start + first)[None]
-
-    return FrameReader(info.path or Path(), part, read, 1, info.decoding_bytes, reader.close)
+    return FrameReader(reader.path, part, lambda index: reader.frame(start + index), reader.close)
 
 
 @contextmanager

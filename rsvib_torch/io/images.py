@@ -20,8 +20,7 @@ from PIL.PngImagePlugin import PngImageFile, putchunk
 from rsvib_torch.files.reading import Table
 from rsvib_torch.io.frame_reader import FrameError, FrameReader, readable_stack
 from rsvib_torch.io.full_scale import known_full_scale
-from rsvib_torch.io.stack_info import DIFFERENT, StackInfo, Tag
-from rsvib_torch.io.stated_metadata import exif_fields
+from rsvib_torch.io.stack_info import DIFFERENT, StackInfo, Tag, exif_fields
 from rsvib_torch.io.tiff import open_tiff, storage_of, write_tiff
 from rsvib_torch.numerics.tables import Array
 
@@ -64,7 +63,7 @@ def _open_image(path: Path) -> FrameReader:
         stated = image.info.get(_FULL_SCALE)
         full_scale = known_full_scale(dtype, None if stated is None else float(stated))
         info = StackInfo(shape, dtype.name, full_scale, **exif_fields(image.info.get("exif", b"")))
-    return FrameReader(path, info, lambda *_: _decoded(path, is_png).reshape(info.shape))
+    return FrameReader(path, info, lambda _: _decoded(path, is_png))
 
 
 def _decoded(path: Path, is_png: bool) -> Array:
@@ -123,26 +122,6 @@ def _frame_files(path: Path) -> list[Path]:
     return sorted(next(iter(found.values())), key=parts)
 
 
-def _frame_numbers(files: list[Path]) -> tuple[int, ...] | None:
-    """Number of frame intervals from the first file to each one, if the numbers in the names show that some are gone.
-
-    Names must differ in one number, whose most common step is its smallest, and divides all steps: frame_0, frame_1,
-    frame_3. Other names, e.g. with times in ms (frame_0, frame_33, frame_67), state nothing.
-    """
-    names = [re.split(r"(\d+)", file.stem) for file in files]
-    if len(files) < 3 or any(len(name) != len(names[0]) or name[::2] != names[0][::2] for name in names):
-        return None
-    numbers = np.array([[int(part) for part in name[1::2]] for name in names], dtype=object)
-    varying = [column for column in numbers.T if len(set(column)) > 1]
-    if len(varying) != 1:
-        return None
-    steps = np.diff(varying[0])
-    step = min(steps)
-    if step < 1 or np.median(steps.astype(float)) != step or any(steps % step) or all(steps == step):
-        return None
-    return tuple(int(number - varying[0][0]) // step for number in varying[0])
-
-
 def open_images(path: Path) -> FrameReader:
     """Open the files of a folder, or one file; frames are decoded on access."""
     files = _frame_files(path)
@@ -172,13 +151,13 @@ def open_images(path: Path) -> FrameReader:
     if path.is_dir() and files[0].suffix.lower() in _TIFF:
         stack = replace(stack, files=tuple(files))
 
-    def read(index: int, _: int) -> Array:
+    def read(index: int) -> Array:
         if files[index] in damaged:
             raise FrameError(str(damaged[files[index]]))
         with closing(_open_image(files[index])) as reader:
-            return reader.frame(0).reshape(1, *stack.shape[1:])
+            return reader.frame(0)
 
-    return FrameReader(path, replace(stack, frame_numbers=_frame_numbers(files)), read)
+    return FrameReader(path, stack, read)
 
 
 def _ending(info: StackInfo) -> str:

@@ -9,9 +9,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from PIL import ExifTags, Image
 
-from rsvib_torch.checks.arguments import check_fields, checked_methods
+from rsvib_torch.checks.arguments import channels_appear_last, check_fields, checked_methods
+from rsvib_torch.files.reading import Table
+from rsvib_torch.io.full_scale import check_dtype, known_full_scale
 from rsvib_torch.results.presentation import Summarised
+from rsvib_torch.text import one_line
 
 # Endings of videos: of those that are written with H.264 and FFV1, and of those that are only read.
 H264, FFV1 = (".mp4", ".mov", ".m4v"), (".mkv",)
@@ -52,8 +56,6 @@ class StackInfo(Summarised):
             and EXIF, e.g. 6 for 90 degrees clockwise. Frames always have the stored rows and columns.
         time_error: Largest error of ``frame_times`` in seconds, e.g. rounding in a video; 0 if they are exact exposure
             starts. Times with an error may run at another rate than the exposures (``exposure_times``).
-        frame_numbers: Number of frame intervals from the first frame to each frame, if frames of a recording are
-            missing and the file states this instead of the times.
         path: The file; None if the stack is not in a file, or has another number of frames than the file.
         metadata: Further metadata of a TIFF file by name, which are kept when it is restored to TIFF; None for those
             that cannot be kept.
@@ -80,7 +82,6 @@ class StackInfo(Summarised):
     orientation: int = 1
     time_error: float = field(default=0.0, compare=False)
     path: Path | None = field(default=None, compare=False)
-    frame_numbers: tuple[int, ...] | None = field(default=None, compare=False)
     metadata: Mapping[str, Tag | None] = field(default_factory=dict, compare=False, repr=False)
     decoding_bytes: int = field(default=0, compare=False)
     camera: str | None = field(default=None, compare=False)
@@ -146,9 +147,7 @@ class StackInfo(Summarised):
         if shape[-2:] != self.shape[-2:]:
             metadata = {name: None if tag is None or tag.scope == "image" else tag for name, tag in metadata.items()}
         if shape[0] != self.shape[0]:
-            return replace(
-                self, shape=shape, metadata=metadata, frame_times=None, frame_numbers=None, path=None, files=None
-            )
+            return replace(self, shape=shape, metadata=metadata, frame_times=None, path=None, files=None)
         return replace(self, shape=shape, metadata=metadata)
 
     def with_frames(self, count: int) -> "StackInfo":
@@ -176,3 +175,68 @@ def split_range(path: Path) -> tuple[Path, tuple[int, int | None] | None]:
 def is_video(path: Path) -> bool:
     """Whether a stack, or frames of it, is a video by its name."""
     return split_range(path)[0].suffix.lower() in VIDEO
+
+
+def orientation_of(value: object) -> int:
+    """The value of an orientation tag, 1 to 8; 1 (as stored) if it is anything else."""
+    return int(value) if isinstance(value, int | np.integer) and value in range(1, 9) else 1
+
+
+def camera_name(make: object, model: object) -> str | None:
+    """Make and model of a camera as one name, with the make once (Canon, Canon EOS R5); None without a model."""
+    maker, name = (one_line("" if text is None else str(text).replace("\0", " "), 60) for text in (make, model))
+    repeated = name.casefold().startswith(maker.casefold())
+    return None if not name else name if repeated else f"{maker} {name}"
+
+
+def attributes_of(info: StackInfo) -> Table:
+    """Attributes of an array in a file, or keys of a TIFF description, that state ``info``, without unknown values."""
+    times = info.frame_times
+    stated: Table = {
+        "full_scale": None if info.full_scale is None else float(info.full_scale),
+        "frame_times": None if times is None else [float(time) for time in times],
+        "frame_rate": None if times is not None or info.frame_rate is None else float(info.frame_rate),
+        "orientation": None if info.orientation == 1 else info.orientation,
+    }
+    return {name: value for name, value in stated.items() if value is not None}
+
+
+def fields_of_attributes(attributes: Table, count: int, dtype: np.dtype) -> Table:
+    """Fields of ``StackInfo`` of ``count`` frames that the attributes state, as ``attributes_of`` writes them."""
+    full_scale, rate = (attributes.get(name) for name in ("full_scale", "frame_rate"))
+    times = np.asarray(attributes.get("frame_times", ()), dtype=np.float64).ravel().tolist()
+    return {
+        "full_scale": known_full_scale(dtype, None if full_scale is None else float(full_scale)),
+        "frame_times": tuple(times) if len(times) == count else None,
+        "frame_rate": None if rate is None else float(np.asarray(rate).item()),
+        "orientation": orientation_of(attributes.get("orientation")),
+    }
+
+
+def info_of_array(shape: tuple[int, ...], dtype: np.dtype, attributes: Table | None = None) -> StackInfo:
+    """An array (H, W), (T, H, W) or (T, C, H, W) in a file as a stack."""
+    check_dtype(dtype)
+    if len(shape) not in (2, 3, 4) or min(shape) < 1:
+        raise ValueError(f"array of shape {shape}; expected (H, W), (T, H, W) or (T, C, H, W)")
+    if channels_appear_last(shape):
+        raise ValueError(f"array of shape {shape} appears to have its channels last; store (T, C, H, W)")
+    stack = shape if len(shape) > 2 else (1, *shape)
+    return StackInfo(stack, dtype.name, **fields_of_attributes(attributes or {}, stack[0], dtype))
+
+
+def check_array(path: Path, info: StackInfo) -> None:
+    """Refuse a shape that would be read as another one."""
+    if channels_appear_last(info.shape):
+        raise ValueError(f"{path}: array of shape {info.shape} would be read as one with channels last; write .tif")
+
+
+def exif_fields(data: bytes) -> Table:
+    """Orientation and camera of one image from its EXIF metadata."""
+    exif = Image.Exif()
+    try:
+        exif.load(data)
+    except Exception:  # damaged metadata raise errors of many types
+        return {}
+    tags = ExifTags.Base
+    camera = camera_name(exif.get(tags.Make), exif.get(tags.Model))
+    return {"orientation": orientation_of(exif.get(tags.Orientation)), "camera": camera}

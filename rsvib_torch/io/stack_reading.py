@@ -78,7 +78,7 @@ def read_stack(path: PathLike | Sequence[PathLike], *, full_scale: float | None 
     """Read a stack of frames from a file, or from several files one after another.
 
     The ending selects the format: TIFF (``.tif``, ``.tiff``; also BigTIFF and compressed), ``.npy`` with (H, W),
-    (T, H, W) or (T, C, H, W), HDF5 (``.h5``, ``.hdf5``), Zarr v3 (``.zarr``),
+    (T, H, W) or (T, C, H, W), HDF5 (``.h5``, ``.hdf5``),
     video (``.mp4``, ``.mov``, ``.mkv``, ``.avi`` and others; grey or RGB, with 8 to 16 bits), a single ``.png`` or
     ``.jpg``, or a folder of PNG, TIFF or JPEG files in natural order (frame9 before frame10). Channels keep the order
     of the file, RGB or RGBA. Frames have the stored rows and columns: an orientation that the file states for display

@@ -28,9 +28,6 @@ def check_info_target(
     """The format in which ``path`` is written, or the error of writing; ``check_folder``: its folder must exist."""
     form = target_format(path)
     check_target(path, form.kind, parent_exists=False)
-    if form.write is None:
-        remedy = "write .tif, .png, .npy, .mkv or a folder of PNG files"
-        raise ValueError(f"{path}: {form.name} files can only be read; {remedy}")
     if info.dtype not in form.dtypes:
         raise ValueError(f"{path}: {form.name} files hold {', '.join(form.dtypes)}; got dtype {info.dtype}")
     if compression is not None:
@@ -41,10 +38,8 @@ def check_info_target(
         form.check(path, info)
     if info.is_integer:
         required_full_scale(info.full_scale, np.dtype(info.dtype), path)
-    if form.kind == "tree" and path.exists() and not (path / form.marker).is_file():  # all its files are replaced
-        raise FileExistsError(f"cannot write {path}: it exists and is not a {form.name} stack; choose another name")
     if check_folder:
-        check_writable(path, folder=form.kind != "file")
+        check_writable(path, folder=form.kind == "folder")
     return form
 
 

@@ -19,8 +19,7 @@ import tifffile
 from rsvib_torch.files.reading import Table
 from rsvib_torch.io.frame_reader import FrameError, FrameReader, contiguous_reader, readable_stack
 from rsvib_torch.io.full_scale import check_dtype
-from rsvib_torch.io.stack_info import Scope, StackInfo, Tag
-from rsvib_torch.io.stated_metadata import attributes_of, fields_of_attributes
+from rsvib_torch.io.stack_info import Scope, StackInfo, Tag, attributes_of, fields_of_attributes
 from rsvib_torch.numerics.tables import Array
 
 _PHOTOMETRIC: tuple[int, ...] = (tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.RGB)
@@ -164,14 +163,14 @@ def open_tiff(path: Path) -> FrameReader:
             raise ValueError(f"axes {axes}: a page has several frames; expected one frame per page")
         of_frames = np.array(numbers).reshape(info.shape[0], -1).tolist()
 
-        def read(first: int, _: int) -> Array:
-            of_frame = [pages[number] for number in of_frames[first]]
+        def read(index: int) -> Array:
+            of_frame = [pages[number] for number in of_frames[index]]
             if not all(_is_complete(page, size) for page in of_frame):
-                raise FrameError(f"{path}: truncated: pixels of frame {first} lie beyond the end of the file")
+                raise FrameError(f"{path}: truncated: pixels of frame {index} lie beyond the end of the file")
             stored = np.stack([page.asarray(maxworkers=1) for page in of_frame if page is not None])
-            return (np.moveaxis(stored, -1, 1) if channels_last else stored).reshape(1, *info.shape[1:])
+            return (np.moveaxis(stored, -1, 1) if channels_last else stored).reshape(info.shape[1:])
 
-        return FrameReader(path, info, read, close=opened.pop_all().close)
+        return FrameReader(path, info, read, opened.pop_all().close)
 
 
 # Metadata

@@ -22,8 +22,7 @@ import numpy as np
 from rsvib_torch.checks.values import needed_package
 from rsvib_torch.files.free_memory import check_fits
 from rsvib_torch.io.frame_reader import FrameError, FrameReader, readable_stack
-from rsvib_torch.io.stack_info import H264, VIDEO, StackInfo
-from rsvib_torch.io.stated_metadata import camera_name
+from rsvib_torch.io.stack_info import H264, VIDEO, StackInfo, camera_name
 from rsvib_torch.numerics.tables import Array
 
 if TYPE_CHECKING:
@@ -226,12 +225,12 @@ class VideoReader(FrameReader):
 
     def __init__(self, path: Path) -> None:
         info, self._times, self.picture = scanned(path)
-        super().__init__(path, info, lambda index, _: _pixels(self._decoded(index))[None])
+        super().__init__(path, info, lambda index: _pixels(self._decoded(index)))
         self._next, self._presented = 0, self._in_order()
 
     def _in_order(self) -> Generator[av.VideoFrame | None, None, None]:
         """The frames in their order, each at its presentation time if they are known; None if it cannot be decoded."""
-        with open_container(self._path) as container, closing(_frames(container)) as decoded:
+        with open_container(self.path) as container, closing(_frames(container)) as decoded:
             frame = next(decoded, None)
             for expected in self._times or repeat(None, self.info.shape[0]):
                 time = None if frame is None or expected is None else _seconds(frame.pts, frame.time_base)
@@ -259,11 +258,11 @@ class VideoReader(FrameReader):
         frame = next(islice(self._presented, index - self._next, None), None)
         self._next = index + 1
         if frame is None:
-            raise FrameError(f"{self._path}: frame {index} cannot be decoded")
+            raise FrameError(f"{self.path}: frame {index} cannot be decoded")
         if frame.is_corrupt:
-            raise FrameError(f"{self._path}: frame {index} is damaged")
+            raise FrameError(f"{self.path}: frame {index} is damaged")
         if (frame.height, frame.width) != self.info.shape[-2:]:
-            raise FrameError(f"{self._path}: frames of different size: frame {index} is {frame.height, frame.width}")
+            raise FrameError(f"{self.path}: frames of different size: frame {index} is {frame.height, frame.width}")
         return frame
 
     def close(self) -> None:

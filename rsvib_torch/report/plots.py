@@ -96,20 +96,6 @@ def _panels(width: float, height: float, rows: int = 1, columns: int = 1, **grid
     return figure, figure.subplots(rows, columns, squeeze=False, **grid)
 
 
-def _offsets_figure(times: Tensor, curves: Sequence[tuple[Sequence[str], Tensor, str | None]]) -> Figure:
-    """A panel for x and y each with offsets over times in s.
-
-    Offsets have a label on each panel, values (N, 2), and a colour (None: that of the axis).
-    """
-    figure, (panels,) = _panels(13, 4.2, 1, 2, sharex=True)
-    for axis, (panel, (name, colour)) in enumerate(zip(panels, _AXIS_COLOURS.items(), strict=True)):
-        for texts, values, other in curves:
-            panel.plot(1e3 * times, values[:, axis], ".", color=other or colour, label=texts[axis])
-        panel.legend(**_LEGEND_ABOVE, ncols=len(curves))
-        plain_axes(panel, _OFFSET_TIME, "offset (px)", heading=f"Offset along {name}")
-    return figure
-
-
 def _plot_axes(
     panel: Axes, x: Array | Tensor, values: Tensor, std: Tensor | None = None, *, legend: bool = True
 ) -> None:
@@ -502,11 +488,13 @@ def picture(frame: Tensor) -> Tensor:
 
 def _measured_offsets_figure(curve: OffsetCurve) -> Figure:
     """Draw the measured offsets of each axis, with error bars of one standard deviation if they are known."""
-    times, offsets = curve.times[curve.good], curve.offsets[curve.good]
-    figure = _offsets_figure(times, [(("measured",) * 2, offsets, None)])
-    if curve.std is not None:
-        for panel, values, std in zip(figure.axes, offsets.T, curve.std[curve.good].T, strict=True):
-            panel.errorbar(1e3 * times, values, std, fmt="none", ecolor=_GRID, zorder=1)
+    times, offsets = 1e3 * curve.times[curve.good], curve.offsets[curve.good]
+    figure, (panels,) = _panels(13, 4.2, 1, 2, sharex=True)
+    for axis, (panel, (name, colour)) in enumerate(zip(panels, _AXIS_COLOURS.items(), strict=True)):
+        std = None if curve.std is None else curve.std[curve.good][:, axis]
+        panel.errorbar(times, offsets[:, axis], std, fmt=".", color=colour, ecolor=_GRID, label="measured")
+        panel.legend(**_LEGEND_ABOVE)
+        plain_axes(panel, _OFFSET_TIME, "offset (px)", heading=f"Offset along {name}")
     return figure
 
 

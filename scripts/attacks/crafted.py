@@ -1,7 +1,6 @@
 """Files that were crafted to exhaust memory or time: each is opened in a child process with limits for both."""
 
 import io
-import json
 import os
 import struct
 import zlib
@@ -13,7 +12,6 @@ from pathlib import Path
 import av
 import h5py
 import numpy as np
-import zarr
 from attacks.files import write_tiff
 from attacks.trial import Trial
 from attacks.warm import in_warm_child
@@ -297,52 +295,6 @@ for _name, _write in {
     "attribute axes of 60 KB": lambda file: _zeros(file, (2, 8, 8)).attrs.update({"axes": "T" * 60_000}),
 }.items():
     CASES[f"HDF5: {_name}"] = partial(_hdf5, write=_write)
-
-# --- Zarr ---------------------------------------------------------------------------------------------------------
-
-
-def _zarr(folder: Path, *, held: int = 100, **keys: object) -> Path:
-    path = folder / "a.zarr"
-    array = zarr.create_array(path, shape=(4, 16, 16), chunks=(1, 16, 16), dtype="u2")
-    array[:] = 1
-    header = json.loads((path / "zarr.json").read_text()) | keys
-    (path / "zarr.json").write_text(json.dumps(header))
-    (path / "more").write_bytes(bytes(held))
-    return path
-
-
-def _chunks(*shape: int) -> dict[str, object]:
-    return {"name": "regular", "configuration": {"chunk_shape": shape}}
-
-
-for _shape3 in ((10**9, 64, 64), (4, 10**6, 10**6), (-1, 16, 16), (10**30, 8, 8)):
-    CASES[f"Zarr: shape {_shape3}"] = partial(_zarr, shape=_shape3)
-for _parts in ((2**40, 2**40, 2**40), (0, 0, 0), (4, 16)):
-    CASES[f"Zarr: chunks {_parts}"] = partial(_zarr, chunk_grid=_chunks(*_parts))
-CASES["Zarr: 10^9 chunks"] = partial(_zarr, held=10**5, shape=(1000, 1000, 1000), chunk_grid=_chunks(1, 1, 1))
-CASES["Zarr: 96 KB that expand to 6.3 GB"] = partial(
-    _zarr, held=96_000, shape=(96, 6000, 5500), chunk_grid=_chunks(1, 6000, 5500)
-)
-CASES["Zarr: chunk of 1 GB"] = partial(_zarr, held=96_000, shape=(512, 1024, 1024), chunk_grid=_chunks(512, 1024, 1024))
-_NESTED = '[{"name":"sharding_indexed","configuration":{"chunk_shape":[1,16,16],"codecs":' * 200
-_NESTED += '[{"name":"bytes"}]' + "}}]" * 200
-CASES["Zarr: codecs in each other"] = partial(_zarr, codecs=json.loads(_NESTED))
-CASES["Zarr: unknown codec"] = partial(_zarr, codecs=[{"name": "pickle"}])
-CASES["Zarr: attribute of 20 MB"] = partial(_zarr, attributes={"axes": "T" * (20 * 10**6)})
-for _header in ("[" * _DEEP, '{"a":' * _DEEP, '{"shape": ' + "9" * 10**6 + "}"):
-    CASES[f"Zarr: header {_header[:15]}"] = lambda folder, text=_header: _data("zarr.json", text, _zarr(folder)).parent
-
-
-def _special_in_zarr(name: str, target: str, folder: Path) -> Path:
-    path = _zarr(folder)
-    _special(name, target, path)
-    return path
-
-
-CASES["Zarr: header is a pipe"] = partial(_special_in_zarr, "zarr.json", "")
-CASES["Zarr: chunk is a pipe"] = partial(_special_in_zarr, "c/0/0/0", "")
-CASES["Zarr: chunk is a link to a device"] = partial(_special_in_zarr, "c/0/0/0", "/dev/urandom")
-CASES["Zarr: folder linked to itself"] = partial(_special_in_zarr, "c/1", ".")
 
 # --- Video --------------------------------------------------------------------------------------------------------
 

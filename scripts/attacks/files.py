@@ -8,7 +8,6 @@ import h5py
 import numpy as np
 import tifffile
 import torch
-import zarr
 from numpy.typing import NDArray
 from small_stack import OPTIONS
 
@@ -51,10 +50,3 @@ def write_hdf5(path: Path, counts: Counts, **options: Any) -> None:
     """Write a data set ``frames``."""
     with h5py.File(path, "w") as file:
         file.create_dataset("frames", data=counts, **options).attrs["full_scale"] = float(FULL_SCALE)
-
-
-def write_zarr(path: Path, counts: Counts, **options: Any) -> None:
-    """Write a Zarr array."""
-    array = zarr.create_array(path, shape=counts.shape, dtype=counts.dtype, **options)
-    array.attrs["full_scale"] = float(FULL_SCALE)
-    array[:] = counts

@@ -21,7 +21,7 @@ def _write_originals(folder: Path, source: Path) -> None:
     """Inputs of all kinds."""
     folder.mkdir()
     counts = tifffile.imread(source)[:4]
-    for name in ("frames.tif", "pngs", "frames.zarr", "frames.npy", "frames.h5", "frames.mkv"):
+    for name in ("frames.tif", "pngs", "frames.npy", "frames.h5", "frames.mkv"):
         write_stack(folder / name, counts)
     (folder / "camera.toml").write_text(CAMERA)
     times = "\n".join(f"{0.001 * index},0.1,0.2" for index in range(100))
@@ -69,7 +69,7 @@ def _attempts(place: Path) -> Iterator[tuple[str, Callable[..., None], tuple[obj
     def command(title: str, *arguments: object) -> tuple[str, Callable[..., None], tuple[object, ...]]:
         return title, _command, ([str(argument) for argument in arguments],)
 
-    stacks = ("frames.tif", "pngs", "frames.zarr", "frames.npy", "frames.h5", "frames.mkv")
+    stacks = ("frames.tif", "pngs", "frames.npy", "frames.h5", "frames.mkv")
     for stack in stacks:
         source = place / stack
         for alias, output in _aliases(source).items():
@@ -97,12 +97,6 @@ def _attempts(place: Path) -> Iterator[tuple[str, Callable[..., None], tuple[obj
     for manifest in ("frames.tif", "restored.tif", "pngs/manifest.json"):
         source = place / ("pngs" if manifest.startswith("pngs") else "frames.tif")
         yield f"process_stack: manifest {manifest}", _processed, (source, place / "restored.tif", place / manifest)
-    (place / "tree.zarr").mkdir()
-    shutil.copy(place / "frames.zarr" / "zarr.json", place / "tree.zarr")
-    shutil.copy(place / "frames.tif", place / "tree.zarr")
-    inside = place / "tree.zarr" / "frames.tif"
-    yield command("known: folder around the input", "restore", inside, place / "tree.zarr", *config, *known)
-    yield "process_stack: folder around the input", _processed, (inside, place / "tree.zarr", None)
 
 
 def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:

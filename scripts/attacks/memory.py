@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import tifffile
-from attacks.files import Counts, vibrating_counts, write_hdf5, write_stack, write_tiff, write_zarr
+from attacks.files import Counts, vibrating_counts, write_hdf5, write_stack, write_tiff
 from attacks.trial import Trial, outcome_of_command, rsvib, run_watched
 
 import rsvib_torch as rsv
@@ -42,9 +42,6 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path, Counts], None]]] = {
     "HDF5, chunk per frame": ("i.h5", partial(write_hdf5, chunks=_FRAME, compression="gzip")),
     "HDF5, one chunk": ("j.h5", partial(write_hdf5, chunks=_STACK, compression="gzip", compression_opts=1)),
     "HDF5, automatic chunks": ("k.h5", partial(write_hdf5, chunks=True, compression="lzf")),
-    "Zarr, chunk per frame": ("l.zarr", partial(write_zarr, chunks=_FRAME)),
-    "Zarr, one chunk": ("m.zarr", partial(write_zarr, chunks=_STACK)),
-    "Zarr, sharded": ("n.zarr", partial(write_zarr, chunks=_FRAME, shards=_STACK)),
     "PNG folder": ("p", write_stack),
     "video": ("q.mkv", write_stack),
 }

@@ -20,7 +20,6 @@ from attacks.files import (
     write_hdf5,
     write_stack,
     write_tiff,
-    write_zarr,
 )
 from attacks.trial import Trial
 from attacks.warm import in_warm_child
@@ -69,7 +68,7 @@ _TEXTS = (".json", ".toml", ".csv", ".gcsv")  # endings of files of text
 # Files to damage, or members of what is read, and how it is read.
 ORIGINALS: dict[str, Callable[[Path], Any]] = {
     **dict.fromkeys(_STACKS, _read_stack),
-    **dict.fromkeys(("pngs/frame_0001.png", "frames.zarr/zarr.json", "frames.zarr/c/1/0/0"), _read_stack),
+    "pngs/frame_0001.png": _read_stack,
     "camera.toml": read_config,
     "motion.csv": lambda path: str(rsv.read_motion(path, unit="px")),
     "clip.gcsv": lambda path: str(rsv.read_gyroscope(path)),
@@ -103,7 +102,6 @@ def write_originals(folder: Path) -> dict[str, bytes]:
     cv2.imwrite(str(folder / "frames.jpg"), colour)
     write_hdf5(folder / "plain.h5", counts)
     write_hdf5(folder / "packed.h5", counts, chunks=(1, 96, 64), compression="gzip")
-    write_zarr(folder / "frames.zarr", counts, chunks=(1, 96, 64))
     (folder / "camera.toml").write_text(CONFIG)
     options: dict[str, Any] = {"window": 3, "detection": DETECTION, "restoration": {"method": "dewarp"}, "workers": 1}
     rsv.process_stack(folder / "own.tif", folder / "out.npy", TIMING, **options)

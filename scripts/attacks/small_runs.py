@@ -32,7 +32,6 @@ FORMATS: dict[str, tuple[str, dict[str, Any]]] = {
     "TIFF, zlib": ("packed.tif", {"compression": "zlib"}),
     "npy": ("out.npy", {}),
     "HDF5": ("out.h5", {}),
-    "Zarr": ("out.zarr", {}),
     "PNG folder": ("frames", {}),
     "video": ("out.mkv", {}),
 }
@@ -53,7 +52,6 @@ def server() -> Any:
             "rsvib_torch.detection.detect",
             "torch.fx.experimental.symbolic_shapes",  # torch imports it when it is used first
             "h5py",
-            "zarr",
             "av",
             "attacks.small_runs",
         ]

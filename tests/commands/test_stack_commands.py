@@ -43,13 +43,13 @@ def command(place, out, *more):
 
 
 def test_run_of_a_long_stack(place, tmp_path, capsys):
-    assert rsvib(*command(place, tmp_path / "out", "--output", "clear.zarr")) == 0
+    assert rsvib(*command(place, tmp_path / "out", "--output", "clear.h5")) == 0
     shown = capsys.readouterr()
     assert shown.err == ""
     assert "13 frames in 4 windows, 4 restored, " in shown.out
-    names = ["before_after.png", "clear.zarr", "manifest.json", "tones.csv", "windows.json", "windows.png"]
+    names = ["before_after.png", "clear.h5", "manifest.json", "tones.csv", "windows.json", "windows.png"]
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == names
-    assert read_stack_info(tmp_path / "out" / "clear.zarr").full_scale == 4095
+    assert read_stack_info(tmp_path / "out" / "clear.h5").full_scale == 4095
     with (tmp_path / "out" / "tones.csv").open() as file:
         lines = list(csv.DictReader(file))
     # one row per window, axis and tone; the middle is that of the exposures of the frames first ... last

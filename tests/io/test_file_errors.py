@@ -202,7 +202,12 @@ def counts_in(folder, **options):
         (lambda at: counts_in(at, full_scale=70000), ValueError, r"70000 exceeds the largest uint16 value"),
         (lambda at: write_stack(at / "a.tif", FRAMES, dtype="uint16"), ValueError, r"a\.tif: full scale of uint16"),
         (lambda at: write_stack(at / "a", FRAMES, dtype="uint8", full_scale=300), ValueError, "exceeds the largest"),
-        (lambda at: write_stack(at / "a.xyz", FRAMES), ValueError, r"unknown file ending '\.xyz'; expected .*\.tif"),
+        (
+            lambda at: write_stack(at / "a.xyz", FRAMES),
+            ValueError,
+            r"unknown file ending '\.xyz'; expected \.npy, \.h5, \.hdf5, \.hdf, \.png, \.tif, \.tiff, \.mkv, \.mp4, "
+            r"\.mov, \.m4v or a name without an ending for a folder",
+        ),
         (lambda at: write_stack(at / "a.png", FRAMES, dtype="uint8"), ValueError, "a PNG file holds one frame, got 3"),
         (lambda at: write_stack(at / "a.png", FRAMES[:1]), ValueError, "png files hold uint8, uint16; got"),
         (lambda at: write_stack(at / "a", FRAMES.new_zeros(3, 5, 9, 7), dtype="uint8"), ValueError, "1, 3 or 4 chan"),

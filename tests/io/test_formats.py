@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import tifffile
 import torch
-import zarr
 from PIL import Image
 from refusals import refuses
 from test_tiff_pages import check_frames
@@ -48,18 +47,11 @@ def values_in_hdf5(path):
         return file["frames"][:]
 
 
-def values_in_zarr(path):
-    array = zarr.open_group(path, mode="r", zarr_format=3)["frames"]
-    assert array.metadata.dimension_names == ("frame", *["channel"][: array.ndim - 3], "y", "x")
-    return array[:]
-
-
 # pixels by other libraries
 READERS = {
     "frames": pixels_of_images,
     "a.tif": tifffile.imread,
     "a.h5": values_in_hdf5,
-    "a.zarr": values_in_zarr,
 }
 
 
@@ -101,7 +93,7 @@ def test_npy_and_single_png(tmp_path):
 
 
 @pytest.mark.parametrize("dtype", ["float16", "float32", "float64"])
-@pytest.mark.parametrize("ending", [".tif", ".npy", ".h5", ".zarr"])
+@pytest.mark.parametrize("ending", [".tif", ".npy", ".h5"])
 def test_floats_keep_their_values_also_nan_and_infinity(tmp_path, dtype, ending):
     frames = torch.tensor([[[0.5, -2.0], [1e4, 0.25]], [[np.nan, np.inf], [0.0, 1.0]]])
     path = tmp_path / f"frames{ending}"
@@ -144,15 +136,12 @@ def test_frames_are_read_one_at_a_time_in_any_order(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file.create_dataset("scan/counts", data=COUNTS, chunks=(2, 4, 4), compression="gzip")
         file.create_dataset("temperature", data=np.zeros(3))
-    group = zarr.create_group(tmp_path / "a.zarr")
-    counts = group.create_array("counts", shape=COUNTS.shape, chunks=(2, 5, 5), dtype=COUNTS.dtype)
-    counts[:] = COUNTS
     (tmp_path / "tiffs").mkdir()
     (tmp_path / "pngs").mkdir()
     for index, frame in enumerate(COUNTS):
         tifffile.imwrite(tmp_path / "tiffs" / f"{index}.tif", frame)
         cv2.imwrite(str(tmp_path / "pngs" / f"{index}.png"), frame)
-    for name in ("a.tif", "a.npy", "a.h5", "a.zarr", "tiffs", "pngs"):
+    for name in ("a.tif", "a.npy", "a.h5", "tiffs", "pngs"):
         check_frames(tmp_path / name, COUNTS)
 
 
@@ -177,14 +166,11 @@ def test_folder_of_float_frames_contains_tiff_files(tmp_path):
     np.testing.assert_allclose(read_stack(tmp_path / "frames").numpy(), COUNTS / 4095, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("ending", "package", "extra"), [(".h5", "h5py", "formats"), (".zarr", "zarr", "formats"), (".mp4", "av", "video")]
-)
+@pytest.mark.parametrize(("ending", "package", "extra"), [(".h5", "h5py", "formats"), (".mp4", "av", "video")])
 def test_missing_package_names_the_extra(tmp_path, monkeypatch, ending, package, extra):
     monkeypatch.setitem(sys.modules, package, None)
     (tmp_path / "a.h5").write_bytes(b"")
     (tmp_path / "a.mp4").write_bytes(b"")
-    (tmp_path / "a.zarr").mkdir()
     message = rf"needs the package {package}: pip install rsvib_torch\[{extra}\]"
     refuses(lambda: read_stack(tmp_path / f"a{ending}"), message, ModuleNotFoundError)
     with pytest.raises(ModuleNotFoundError, match=message):

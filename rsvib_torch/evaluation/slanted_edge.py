@@ -3,14 +3,16 @@
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from scipy.optimize import brentq
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import ArrayLike, as_tensor, checks_arguments
 from rsvib_torch.checks.values import check_number
-from rsvib_torch.evaluation.mtf.edge import check_edge, check_roi, fit_edge, straighten
-from rsvib_torch.evaluation.mtf.spread import Tail, fit_spread
+from rsvib_torch.evaluation.edge_fit import Scatter, check_edge, check_roi, fit_edge
+from rsvib_torch.evaluation.edge_spread import Tail, fit_spread
+from rsvib_torch.numerics.tables import Array
 from rsvib_torch.results.presentation import Result
 from rsvib_torch.text import measured_text
 
@@ -91,7 +93,8 @@ class MtfCurve(
         wanted = torch.as_tensor(frequency, dtype=torch.float64, device=self.lsf.device)
         if not bool(((wanted >= 0) & (wanted <= 1)).all()):
             raise ValueError(f"frequency must lie within 0 ... 1 cycles/px, got {wanted.min():g} ... {wanted.max():g}")
-        return self.tail.transfer(self.position, self.lsf, self.far, wanted.flatten()).abs().view(wanted.shape)
+        spread = (value.cpu().numpy() for value in (self.position, self.lsf, self.far, wanted.flatten()))
+        return torch.from_numpy(np.abs(self.tail.transfer(*spread))).to(wanted).view(wanted.shape)
 
 
 @checks_arguments
@@ -126,38 +129,42 @@ def slanted_edge_mtf(roi: ArrayLike) -> MtfCurve:
         '5.71 degrees, MTF50 0.2354, at Nyquist 0.0438'
     """
     grey = as_tensor("roi", roi)
-    values = check_roi(grey)
-    limits = (0.0, 1.0)
+    if grey.dtype == torch.bool or grey.dtype.is_complex:
+        raise TypeError(f"roi must hold real numbers, got {grey.dtype}")
+    values, limits = grey.detach().to("cpu", torch.float64).numpy(), (0.0, 1.0)
     if not grey.dtype.is_floating_point:
         limits = (float(torch.iinfo(grey.dtype).min), float(torch.iinfo(grey.dtype).max))
-    scatter = straighten(values)
-    fit = fit_edge(scatter)
-    spread = fit_spread(fit, scatter, room=check_edge(fit, scatter, limits))
-
-    frequency = torch.linspace(0, 1, 101, dtype=torch.float64, device=grey.device)
-    mtf = spread.mtf(frequency)
-    below = (mtf <= 0.5).nonzero()
-    crossing = math.nan
+    # 1. Edge and spread functions.
+    check_roi(values)
+    fit = fit_edge(Scatter.of(values))
+    spread = fit_spread(fit, room=check_edge(fit, limits))
+    # 2. MTF, and where it first falls to one half.
+    frequency = np.linspace(0.0, 1.0, 101)
+    mtf, mtf50 = spread.mtf(frequency), math.nan
+    below = np.flatnonzero(mtf <= 0.5)
     if len(below):
-        around = frequency[int(below[0]) - 1 : int(below[0]) + 1].tolist()
-        crossing = brentq(lambda f: float(spread.mtf(frequency.new_tensor([f]))) - 0.5, *around, xtol=1e-15)
-    mtf50 = frequency.new_tensor(crossing)
+        around = frequency[below[0] - 1 : below[0] + 1]
+        mtf50 = brentq(lambda f: spread.mtf(np.array([f]))[0] - 0.5, *around, xtol=1e-15)
     step = 1e-4  # cycles/px, for the slope of the curve
-    beside = spread.mtf(torch.stack([mtf50 - step, mtf50 + step]))
-    mtf50_std = spread.std(mtf50[None])[0] * 2 * step / (beside[1] - beside[0]).abs()
+    low, high = spread.mtf(np.array([mtf50 - step, mtf50 + step]))
+    mtf50_std = spread.std(np.array([mtf50]))[0] * 2 * step / abs(high - low)
+
+    def tensor(value: Array | float) -> Tensor:
+        return torch.as_tensor(value, dtype=torch.float64, device=grey.device)
+
     return MtfCurve(
-        frequency=frequency,
-        mtf=mtf,
-        std=spread.std(frequency),
-        mtf50=mtf50,
-        mtf50_std=mtf50_std,
-        angle=spread.fit.angle(scatter),
-        near_vertical=scatter.near_vertical,
-        position=spread.position,
-        esf=spread.esf,
-        lsf=spread.lsf,
+        frequency=tensor(frequency),
+        mtf=tensor(mtf),
+        std=tensor(spread.std(frequency)),
+        mtf50=tensor(mtf50),
+        mtf50_std=tensor(mtf50_std),
+        angle=spread.fit.angle,
+        near_vertical=fit.scatter.near_vertical,
+        position=tensor(spread.position),
+        esf=tensor(spread.esf),
+        lsf=tensor(spread.lsf),
         tail=spread.tail,
-        far=spread.far,
-        levels=spread.fit.sides[:, 0],
-        noise=spread.noise,
+        far=tensor(spread.far),
+        levels=tensor(spread.fit.sides[:, 0]),
+        noise=tensor(spread.noise),
     )
