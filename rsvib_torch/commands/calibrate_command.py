@@ -34,7 +34,7 @@ class CalibrateOptions:
         None, show_default="a readout within a tenth to the whole of the frame period", **shared.TIME
     )
     """With --by-motion: given twice, the shortest and the longest possible row time, e.g. 10us."""
-    exposure: float | None = option(None, show_default="left open in the file", **shared.TIME)
+    exposure_time: float | None = option(None, "--exposure", show_default="left open in the file", **shared.TIME)
     """Exposure time, e.g. 1/1000: the setting of the camera."""
     readout_direction: Literal["forward", "reverse"] | None = option(None, show_default="determined from the frames")
     """With --by-motion, if known: forward if the top row (or left column) is read first, reverse if the last one is."""
@@ -57,6 +57,8 @@ def calibrate(given: CalibrateOptions) -> Answer:
     """
     light: Table = {"flicker_frequency": given.flicker_frequency}
     limits = None if given.row_time is None else tuple(given.row_time)
+    if limits is not None and len(limits) != 2:
+        raise ValueError("give --row-time twice: the shortest and the longest possible row time")
     motion: Table = {"row_time": limits, "readout_direction": given.readout_direction}
     chosen, others = (motion, light) if given.by_motion else (light, motion)
     if any(value is not None for value in others.values()):
@@ -76,8 +78,8 @@ def calibrate(given: CalibrateOptions) -> Answer:
     for sentence in (sentence for info in infos for sentence in io.describe_stack(info, None)):
         note(sentence)
     of_both: Table = {name: value for name, value in chosen.items() if value is not None}
-    if given.by_motion and given.exposure is not None:
-        of_both["exposure_time"] = given.exposure
+    if given.by_motion and given.exposure_time is not None:
+        of_both["exposure_time"] = given.exposure_time
     of_both |= {"frame_rate": given.frame_rate, "scan_axis": -1 if given.scan_axis == "x" else -2}
     if given.by_motion and given.frame_rate is None:
         of_both["frame_rate"] = shared.rate_of_file(paths[0])
@@ -93,7 +95,7 @@ def calibrate(given: CalibrateOptions) -> Answer:
     period: Table = {"frame_rate": None} if result.frame_rows is None else {"frame_rows": result.frame_rows}
     direction = {"readout_direction": result.readout_direction} if given.by_motion else {}
     values: Table = {name: getattr(result, name) for name in ("row_time", "row_time_std")}
-    values |= {"exposure_time": given.exposure} | period | {"scan_axis": given.scan_axis} | direction
+    values |= {"exposure_time": given.exposure_time} | period | {"scan_axis": given.scan_axis} | direction
     table = sensor_toml(values, ["Written by rsvib calibrate.", *result.notes])  # unknown values are comments
     rows = stack.shape[of_both["scan_axis"]]
     readout = measured_text(1e3 * result.row_time * rows, 1e3 * result.row_time_std * rows)

@@ -14,7 +14,7 @@ from rsvib_torch.commands import answers
 from rsvib_torch.commands import shared_options as shared
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.stack_commands import print_notes
-from rsvib_torch.commands.terminal import Answer, warn, working
+from rsvib_torch.commands.terminal import Answer, current_output, warn, working
 from rsvib_torch.files.reading import Table
 from rsvib_torch.options import MotionUnit, ProcessStackOptions
 
@@ -83,6 +83,7 @@ def restore(given: RestoreOptions) -> Answer:
     outputs = [*io.stack_files(given.restored), given.manifest]
     replaces = given.overwrite or "resume" in given.processing
     shared.check_new(outputs, replaces, [*given.inputs, vibration, given.motion, given.lens_profile])
+    current_output().work = stacks.work_folder(given.restored)
     info, scale, chosen = given.planned_restoration(given.restoration)
     shape = info.restored_as(chosen.get("scale", 1), chosen.get("mosaic")).shape
     shape = (1, *shape[1:]) if chosen.get("joint") is True else shape

@@ -263,12 +263,15 @@ def stated_exposure(path: Path) -> float | None:
 def check_new(
     paths: Iterable[Path], overwrite: bool, inputs: Iterable[Path | None], *, folder: Path | None = None
 ) -> None:
-    """Raise an error if results would replace an input, or exist and must not be replaced.
+    """Raise an error if an input is missing, or if results would replace one, or exist and must not be replaced.
 
     Of folders, which are written as a whole, an empty one may exist. ``folder`` is as in ``check_outputs``.
     """
-    paths = list(paths)
-    check_outputs(paths, [path for path in inputs if path is not None], folder=folder)
+    paths, inputs = list(paths), [path for path in inputs if path is not None]
+    missing = next((path for path in inputs if not path.exists()), None)
+    if missing is not None:
+        raise FileNotFoundError(f"{missing} does not exist")
+    check_outputs(paths, inputs, folder=folder)
     existing = [path for path in paths if os.path.lexists(path) and not (path.is_dir() and not any(path.iterdir()))]
     if existing and not overwrite:
         found = f"results exist already in {existing[0].parent}: {', '.join(path.name for path in existing)}"
@@ -290,12 +293,15 @@ def _restoration_options(info: "StackInfo", full_scale: float | None, options: T
         if given["joint"] != "all" and not (given["joint"].isdecimal() and int(given["joint"]) >= 1):
             raise ValueError(f"--joint must be 'all' or a number of frames, got {given['joint']!r}")
         given["joint"] = given["joint"] == "all" or int(given["joint"])
+        if given["joint"] > info.shape[0]:
+            raise ValueError(f"--joint {given['joint']} exceeds the number of frames, {info.shape[0]}; 'all' uses all")
     options |= given
     checked = RestorationOptions(**options)
     if options.get("saturation") == "auto":
         del options["saturation"]
-    if info.is_integer and full_scale is not None:  # of frames whose full scale is 1
-        options["saturation"] = (options.get("saturation") or full_scale) / full_scale
+    level = options.get("saturation", full_scale)  # None: no pixels are saturated
+    if info.is_integer and full_scale is not None and level is not None:  # of frames whose full scale is 1
+        options["saturation"] = level / full_scale
     if checked.mosaic is not None:
         preparation.check_mosaic(checked.mosaic, info.shape)
     if checked.optics is not None:

@@ -89,7 +89,7 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
         for record, middle in zip(self.windows, self._middle_times(), strict=True):
             first: Table = {"window": record.window, "first_frame": record.first, "last_frame": record.last}
             first |= {"start_s": record.start_time, "middle_time_s": middle}
-            last: Table = {"frames": record.frames, "outcome": record.outcome}
+            last: Table = {"equivalent": record.motion is not None, "frames": record.frames, "outcome": record.outcome}
             last["bad_frames"] = len(record.bad_frames)
             last["note"] = record.error or "; ".join(map(str, record.left_alone))
             tones = [{}] if record.detection is None else record.detection.tone_lines(pixel_size)

@@ -162,7 +162,7 @@ def test_full_scale_comes_from_option_file_or_config(place, tmp_path, capsys):
     for command in (("detect", "--out", tmp_path / "out2"), ("restore", tmp_path / "r.tif", *found)):
         unknown = refused(capsys, command[0], arguments[0], *command[1:], "--config", silent)
         assert "plain.tif: the full scale of its uint16 counts is not known: give --full-scale, e.g. 4095" in unknown
-    assert "beyond full_scale=100" in refused(capsys, "detect", *arguments, "--full-scale", 100)
+    assert "beyond --full-scale=100" in refused(capsys, "detect", *arguments, "--full-scale", 100)
     assert not (tmp_path / "out2").exists()
 
 
@@ -198,7 +198,7 @@ def test_outputs_that_cannot_be_written(place, vibration_text, tmp_path, capsys,
         (("run", frames, tmp_path / "file" / "out", *config), "file is not writable"),
         (restore_arguments(place, tmp_path, "f.webm"), "wmv files can only be read"),
         (("run", tmp_path / "none.tif", tmp_path / "out", *config), "none.tif does not exist"),
-        (("detect", frames, "--config", "none.toml", "--out", tmp_path / "out"), "none.toml: No such"),
+        (("detect", frames, "--config", "none.toml", "--out", tmp_path / "out"), "none.toml does not exist"),
     ]
 
     def refuse(*args, **kwargs):
