@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from rsvib_torch.checks.validation import MistakesError, options, validate
+from rsvib_torch.checks.values import MistakesError, options, validate
 from rsvib_torch.files.reading import Table, read_toml
 from rsvib_torch.motion.timing import SensorSection, SensorTiming
 from rsvib_torch.options import RestorationOptions, ToneOptions, WindowOptions

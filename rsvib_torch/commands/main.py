@@ -11,23 +11,21 @@ from typing import Annotated
 import typer
 
 import rsvib_torch
-from rsvib_torch.checks.validation import MistakesError
-from rsvib_torch.commands import stack_commands
-from rsvib_torch.commands.calibrate_command import calibrate
+from rsvib_torch.checks.values import MistakesError
+from rsvib_torch.commands.camera_commands import calibrate, cameras, init
 from rsvib_torch.commands.flat_command import flat_command
-from rsvib_torch.commands.init import cameras, init
 from rsvib_torch.commands.live_command import live_session
-from rsvib_torch.commands.restore_command import restore
 from rsvib_torch.commands.run_stack import run
+from rsvib_torch.commands.stack_commands import detect, motion, restore
 from rsvib_torch.commands.terminal import Answer, current_output, error_line, print_line, running, warnings_in_one_line
 
 _COMMANDS: dict[str, Callable[..., Answer]] = {  # in the order of the help
     "init": init,
     "cameras": cameras,
     "run": run,
-    "detect": stack_commands.detect,
+    "detect": detect,
     "restore": restore,
-    "motion": stack_commands.motion,
+    "motion": motion,
     "calibrate": calibrate,
     "live": live_session,
 }

@@ -10,7 +10,7 @@ import rsvib_torch
 from rsvib_torch import detection, io, stacks, video
 from rsvib_torch import frames as preparation
 from rsvib_torch import report as reports
-from rsvib_torch.checks.validation import options
+from rsvib_torch.checks.values import options
 from rsvib_torch.commands import answers
 from rsvib_torch.commands.flat_command import Given, argument
 from rsvib_torch.commands.shared_options import PixelSizeOptions, RestorationCommand, VerdictOptions

@@ -14,7 +14,7 @@ import typer
 from rsvib_torch import frames as preparation
 from rsvib_torch import gyroscope, io
 from rsvib_torch import restoration as restore
-from rsvib_torch.checks.validation import options
+from rsvib_torch.checks.values import options
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.terminal import note
 from rsvib_torch.config import Config, read_config
@@ -267,11 +267,11 @@ def check_new(
 
     Of folders, which are written as a whole, an empty one may exist. ``folder`` is as in ``check_outputs``.
     """
-    paths, inputs = list(paths), [path for path in inputs if path is not None]
-    missing = next((path for path in inputs if not path.exists()), None)
+    paths, sources = list(paths), [path for path in inputs if path is not None]
+    missing = next((path for path in sources if not path.exists()), None)
     if missing is not None:
         raise FileNotFoundError(f"{missing} does not exist")
-    check_outputs(paths, inputs, folder=folder)
+    check_outputs(paths, sources, folder=folder)
     existing = [path for path in paths if os.path.lexists(path) and not (path.is_dir() and not any(path.iterdir()))]
     if existing and not overwrite:
         found = f"results exist already in {existing[0].parent}: {', '.join(path.name for path in existing)}"

@@ -12,14 +12,12 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import checks_arguments
-from rsvib_torch.checks.validation import read_json
-from rsvib_torch.checks.values import check_single
+from rsvib_torch.checks.values import check_single, read_json
 from rsvib_torch.detection import DetectionResult, MotionDetection
 from rsvib_torch.files.atomic import whole_file, write_json
 from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.results.presentation import Result, plain_values
-from rsvib_torch.results.result_files import result_of
+from rsvib_torch.results.presentation import Result, plain_values, result_of
 from rsvib_torch.stacks import RestoredFrames
 from rsvib_torch.text import quoted
 

@@ -318,7 +318,9 @@ def plan_job(
     stated = ProcessStackOptions(**{**vars(options), **of_job})
     windows = cut_windows(info.shape[0], stated.window)
     given = _given(stated, info, timing, windows)
-    job = StackJob(Path(source), info, timing, replace(stated, given=None, motion=None), given, stated.motion is not None)
+    job = StackJob(
+        Path(source), info, timing, replace(stated, given=None, motion=None), given, stated.motion is not None
+    )
     if job.chosen.mosaic is not None:
         check_mosaic(job.chosen.mosaic, info.shape, str(source))
     check_optics(job.chosen.optics)

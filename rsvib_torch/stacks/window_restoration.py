@@ -138,10 +138,8 @@ def may_change(detection: DetectedVibration, num_frames: int) -> bool:
 _NEARLY_BLIND = 0.5  # offset gain; of the sweeps and decays below, 0.06 to 0.18, of others 1.6 and more
 
 
-def with_known_size(
-    found: MotionDetection, detected: DetectedVibration
-) -> tuple[MotionDetection, DetectedVibration]:
-    """A motion, and its equivalent tones, whose axes are refused if most of it is common to all frames, so that its size is not known.
+def with_known_size(found: MotionDetection, detected: DetectedVibration) -> tuple[MotionDetection, DetectedVibration]:
+    """A motion and its equivalent tones, without axes whose size is not known: most of it is common to all frames.
 
     That is so if the steady tone that was ``detected`` has a small gain, and the standard deviation is more than a
     quarter of the displacement. Vibrations that sweep or decay near the frame rate were wrong by 7 standard deviations,

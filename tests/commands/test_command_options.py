@@ -47,7 +47,10 @@ def test_mistakes_are_those_of_the_file_or_of_the_command_line(place, tmp_path, 
         (("calibrate", "--by-motion", "--frame-rate", 90, "--exposure", 20), "--exposure=20 s exceeds the frame"),
         (("detect", "--config", "{}", "--out", "d", "--full-scale", 0), "--full-scale must be larger than 0"),
         (("motion", "--config", "{}", "--out", "m.csv", "--knot-rows", 1), "--knot-rows must be at least 4"),
-        (("run", "r", "--config", "{}", "--method", "exact", "--joint", 4), "--joint 4 exceeds the number of frames, 3"),
+        (
+            ("run", "r", "--config", "{}", "--method", "exact", "--joint", 4),
+            "--joint 4 exceeds the number of",
+        ),
     ],
 )
 def test_errors_name_options_instead_of_arguments_of_python(place, tmp_path, monkeypatch, capsys, arguments, message):
