@@ -87,14 +87,14 @@ def _parameter(name: str, annotation: object, default: object, form: Table) -> i
     choices = tuple(choice for member in members if get_origin(member) is Literal for choice in get_args(member))
     plain = [member for member in members if get_origin(member) is not Literal]
     if choices and float in plain:  # a number, or a word
-        words = (*choices, *["none"] * (NoneType in get_args(annotation)))
+        words = (*choices, *(("none",) if NoneType in get_args(annotation) else ()))
         form = {"parser": partial(_number_or_word, words), "metavar": "|".join(("NUMBER", *words))} | form
     kind: Any = str if str in plain else plain[0] if plain else type(choices[0])
     kind = Literal[choices] if not plain and kind is str else kind
     option_name = f"--{name.replace('_', '-')}"
     names = form.pop("names", ()) or ([option_name] if kind is bool else [])
     make: Callable[..., object] = typer.Argument if form.pop("positional", False) else typer.Option
-        words = (*choices, *(("none",) if NoneType in get_args(annotation) else ()))
+    info = make(*names, help=form.pop("text"), **{"show_default": True} | form)
     default = False if default is None and kind is bool else default
     kind = Annotated[kind | None if default is None else kind, info]
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
