@@ -88,7 +88,8 @@ def _parameter(name: str, annotation: object, default: object, form: Table) -> i
     plain = [member for member in members if get_origin(member) is not Literal]
     if choices and float in plain:  # a number, or a word
         words = (*choices, *(("none",) if NoneType in get_args(annotation) else ()))
-        form = {"parser": partial(_number_or_word, words), "metavar": "|".join(("NUMBER", *words))} | form
+        form.setdefault("parser", partial(_number_or_word, words))
+        form.setdefault("metavar", "|".join(("NUMBER", *words)))
     kind: Any = str if str in plain else plain[0] if plain else type(choices[0])
     kind = Literal[choices] if not plain and kind is str else kind
     option_name = f"--{name.replace('_', '-')}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from rsvib_torch.detection import DetectionResult
 
 
-_RESULTS = (*answers.OF_DETECTION, *answers.OF_WINDOWS, "restoration.json", "before_after.png", "report.html")
+_RESULTS = (*answers.OF_DETECTION, *answers.OF_WINDOWS, "before_after.png", "report.html")
 _PROCESSING = ("resume", "compression", "memory", "workers")
 
 
@@ -145,7 +145,6 @@ class _Shown:
     stored: stacks.StackManifest  # all windows
     detection: DetectionResult | None = None  # of a steady vibration
     restoration: stacks.RestoredFrames | None = None  # its verdict
-    options: Table = field(default_factory=dict)  # of ``restore``
 
     @property
     def windows(self) -> stacks.StackManifest | None:
@@ -202,7 +201,7 @@ def _show_window(
     if found is not None and found.timing is not None and result.windows > 1:
         timing = found.timing
     shown = (before, after, next(iter(indices), 0), first.restored, timing, stored)
-    return _Shown(*shown, detection=found, restoration=first.restoration, options=restoration)
+    return _Shown(*shown, detection=found, restoration=first.restoration)
 
 
 def _show_video(given: RunOptions, restored: Path, info: io.StackInfo, stored: stacks.StackManifest) -> _Shown:
@@ -223,8 +222,7 @@ def _describe(folder: Path, given: RunOptions, result: stacks.StackReport, shown
     """Write the tables and figures of one vibration of all frames, or of the windows; their names are added."""
     frames, found, judged = given.frames, shown.detection, shown.restoration
     if shown.windows is None and found is not None and judged is not None:
-        reports.write_restoration(folder / "restoration.json", judged, shown.options, result.not_kept)
-        names += [*answers.write_detection(folder, found, shown.timing, given.pixel_size), "restoration.json"]
+        names += answers.write_detection(folder, found, shown.timing, given.pixel_size)
         answers.warn_of_restoration(judged)
         answer = answers.stack_answer(frames, found, given.pixel_size, judged, given.info.shape[0])
         answer.next_steps = answers.steps_after_detection(found, frames, given.settings)
