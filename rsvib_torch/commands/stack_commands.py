@@ -137,13 +137,6 @@ class RestoreOptions(shared.RestorationCommand):
     """With a gyroscope: lens profile of Gyroflow (JSON)."""
     offset: float | None = option(None, show_default="estimated from the frames")
     """With --unit: time of the recording, in s, at the exposure start of the first row of frame 0."""
-    offsets: tuple[float, float] | None = option(
-        None, metavar="LOW HIGH", show_default="all for which the recording covers the frames"
-    )
-    """With --motion: smallest and largest time of the recording, in s, at the exposure start of the first row of frame
-    0, between which it is estimated."""
-    fit_row_time: bool = False
-    """With a gyroscope: estimate the row time from the frames as well."""
     ignore: list[str] | None = option(None, metavar="ROWS[,COLUMNS]", show_default="all rows count")
     """Rows of the frames, or a part of them, that do not count in the comparison with the recording, for example 400:
     for a dashboard below row 400, or :60,500: for a sign in a corner; may be given several times."""
@@ -185,7 +178,6 @@ def restore(given: RestoreOptions) -> Answer:
     io.check_stack_target(given.restored, shape, dtype=info.dtype, full_scale=scale, like=info)
     of_run = given.of_stack(scale, chosen) | {"force": given.force} | given.processing
     # 1. The vibration of all frames, or the motion on the clock of the frames.
-    timing = settings.timing
     if vibration is not None and given.motion is None:
         detected = reports.read_vibration(vibration, io.timing_from_first_frame(settings.timing, info))
         stacks.check_stack_fits(info, chosen, on_gpu=given.torch_device.type != "cpu")
@@ -194,7 +186,7 @@ def restore(given: RestoreOptions) -> Answer:
         answer = Answer({"Vibration": [detected.summary()]}, {"detection": answers.detection_data(detected)})
     elif given.motion is not None and vibration is None:
         answer = Answer({}, {"alignment": None})
-        of_run["motion"], timing = _motion_of_frames(given, given.motion, replace(info, full_scale=scale), answer)
+        of_run["motion"] = _motion_of_frames(given, given.motion, replace(info, full_scale=scale), answer)
         of_run["window"] = given.processing.get("window", settings.stack.get("window", 8))
     else:
         raise ValueError("give --vibration FILE, or --motion FILE of a recording")
@@ -202,53 +194,36 @@ def restore(given: RestoreOptions) -> Answer:
     counts = info.shape[0] > of_run["window"]
     with working(f"restoring {frames.name}", counts=counts) as progress:
         of_run["progress"] = progress if counts else None
-        run = stacks.process_stack(frames, given.restored, timing, **of_run)
+        run = stacks.process_stack(frames, given.restored, settings.timing, **of_run)
     answer.results["Restoration"], answer.data["restoration"] = answers.restoration_of(run, given.restored)
     answer.files += [given.restored, given.manifest]
     return answer
 
 
-def _motion_of_frames(
-    given: RestoreOptions, path: Path, info: StackInfo, answer: Answer
-) -> tuple[rsvib_torch.FreeMotion, rsvib_torch.SensorTiming]:
-    """A recorded motion on the clock of the frames, which is stated or estimated.
-
-    The second value is the timing of the frames, with the row time by ``--fit-row-time``.
-    """
+def _motion_of_frames(given: RestoreOptions, path: Path, info: StackInfo, answer: Answer) -> rsvib_torch.FreeMotion:
+    """A recorded motion on the clock of the frames, which is stated or estimated."""
     recorded, timing = _recorded(given, path), given.settings.timing
     ignore = stacks.mask_of_regions(given.ignore or (), (info.shape[-2], info.shape[-1]))
     print_notes(info, given.settings)
     if isinstance(recorded, rsvib_torch.FreeMotion) and given.offset is not None:
-        placed = _placed(given, recorded, timing, given.offset)
-    else:
-        chosen = gyroscope.AlignOptions(
-            camera=_camera(given), offsets=given.offsets, ignore=ignore, fit_row_time=given.fit_row_time
-        )
-        with working("aligning the recording"):
-            found = stacks.align_stack(given.frames, info, timing, recorded, chosen)
-        answer.results["Recording on the clock of the frames"] = [found.summary()]
-        answer.data["alignment"] = answers.without_curves(found)
-        _refuse(given, found.reasons)
-        placed = found.motion
-        if isinstance(found, gyroscope.RotationAlignment) and given.fit_row_time:  # times in s stay the same
-            rows = timing.row_time / found.row_time
-            timing = replace(
-                timing,
-                row_time=found.row_time,
-                exposure_rows=rows * timing.exposure_rows,
-                frame_rows=rows * timing.frame_rows,
-                row_time_std=found.row_time_std,
-            )
-    return placed, timing
+        return _placed(given, recorded, timing, given.offset)
+    chosen = gyroscope.AlignOptions(camera=_camera(given), ignore=ignore)
+    with working("aligning the recording"):
+        found = stacks.align_stack(given.frames, info, timing, recorded, chosen)
+    answer.results["Recording on the clock of the frames"] = [found.summary()]
+    answer.data["alignment"] = answers.without_curves(found)
+    if found.reasons and not given.force:
+        raise ValueError(f"{path}: {'; '.join(found.reasons)}; --force restores with it nevertheless")
+    for reason in found.reasons:
+        warn(reason)
+    return found.motion
 
 
 def _recorded(given: RestoreOptions, path: Path) -> rsvib_torch.FreeMotion | rsvib_torch.AngularRates:
     """The motion of a CSV file, or the rates of a gyroscope."""
-    if given.offset is not None and given.offsets is not None:
-        raise ValueError("--offset states the clock and --offsets limits its estimate: give one of them")
     if given.unit is not None:
-        if given.fit_row_time or given.lens_profile is not None:
-            raise ValueError("--fit-row-time and --lens-profile are for a gyroscope, without --unit")
+        if given.lens_profile is not None:
+            raise ValueError("--lens-profile is for a gyroscope, without --unit")
         return rsvib_torch.read_motion(path, unit=given.unit, focal_length=given.focal_length)
     if given.offset is not None:
         raise ValueError("--offset needs --unit; axes and clock of a gyroscope are estimated from the frames")
@@ -276,11 +251,3 @@ def _placed(
         needed = f"the frames need {offset:.6g} to {offset + last:.6g} s"
         raise ValueError(f"{given.motion}: covers {recorded.start:.6g} to {recorded.end:.6g} s, {needed}")
     return placed
-
-
-def _refuse(given: RestoreOptions, reasons: tuple[str, ...]) -> None:
-    """Raise an error with the reasons against a recording, or print them as warnings with ``--force``."""
-    if reasons and not given.force:
-        raise ValueError(f"{given.motion}: {'; '.join(reasons)}; --force restores with it nevertheless")
-    for reason in reasons:
-        warn(reason)
