@@ -76,10 +76,9 @@ def run(given: RunOptions) -> Answer:
     replaces = given.overwrite or "resume" in given.processing
     answers.check_folder(out, _RESULTS, replaces, given.inputs, out / output)
     current_output().work = stacks.work_folder(out / output)
-    info, scale, restoration = given.planned_restoration(given.restoration)
+    info, common = given.info, given.of_stack
     print_notes(info, settings)
     chosen = WindowOptions(**{**settings.stack, **given.windows})
-    common = given.of_stack(scale, restoration)
     # 1. Process windows, or a video of more than one window from frame to frame.
     followed = bool(given.moved) or (given.video and io.is_video(frames) and info.shape[0] > chosen.window)
     result = _process_video(given, out / output, common) if followed else _process(given, out / output, common, chosen)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import rsvib_torch
-from rsvib_torch import detection, gyroscope, io, stacks
+from rsvib_torch import detection, io, stacks
 from rsvib_torch import report as reports
 from rsvib_torch.checks.values import options
 from rsvib_torch.commands import answers
@@ -172,11 +172,11 @@ def restore(given: RestoreOptions) -> Answer:
     replaces = given.overwrite or "resume" in given.processing
     shared.check_new(outputs, replaces, [*given.inputs, vibration, given.motion, given.lens_profile])
     current_output().work = stacks.work_folder(given.restored)
-    info, scale, chosen = given.planned_restoration(given.restoration)
+    info, scale, chosen = given.info, given.scale, given.of_stack["restoration"]
     shape = info.restored_as(chosen.get("scale", 1), chosen.get("mosaic")).shape
     shape = (1, *shape[1:]) if chosen.get("joint") is True else shape
     io.check_stack_target(given.restored, shape, dtype=info.dtype, full_scale=scale, like=info)
-    of_run = given.of_stack(scale, chosen) | {"force": given.force} | given.processing
+    of_run = given.of_stack | {"force": given.force} | given.processing
     # 1. The vibration of all frames, or the motion on the clock of the frames.
     if vibration is not None and given.motion is None:
         detected = reports.read_vibration(vibration, io.timing_from_first_frame(settings.timing, info))
@@ -207,9 +207,9 @@ def _motion_of_frames(given: RestoreOptions, path: Path, info: StackInfo, answer
     print_notes(info, given.settings)
     if isinstance(recorded, rsvib_torch.FreeMotion) and given.offset is not None:
         return _placed(given, recorded, timing, given.offset)
-    chosen = gyroscope.AlignOptions(camera=_camera(given), ignore=ignore)
+    camera = _camera(given)
     with working("aligning the recording"):
-        found = stacks.align_stack(given.frames, info, timing, recorded, chosen)
+        found = stacks.align_stack(given.frames, info, timing, recorded, camera=camera, ignore=ignore)
     answer.results["Recording on the clock of the frames"] = [found.summary()]
     answer.data["alignment"] = answers.without_curves(found)
     if found.reasons and not given.force:
