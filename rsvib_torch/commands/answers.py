@@ -141,7 +141,8 @@ def steps_after_detection(
         steps.append(next_step("restore the frames", *restore))
     reasons = [reason for of_axis in result.findings for reason in of_axis]
     if any(reason.kind.free_model for reason in reasons):
-        if vibration is not None:  # not after a run in windows, which has measured those that change
+        # a run in windows measures vibrations that change, unless the frames agree with another timing
+        if vibration is not None and not any(reason.code.startswith("other_") for reason in reasons):
             command = ("run", frames, frames.with_name("results"), *settings.arguments)
             steps.append(next_step("measure a vibration that changes, and restore the frames", *command))
         motion = ("motion", frames, *settings.arguments, "--out", "motion.csv")
