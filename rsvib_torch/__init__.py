@@ -8,7 +8,7 @@ from pathlib import Path
 
 import lazy_loader
 
-from rsvib_torch.results.higher_packages import IMPORTERS
+from rsvib_torch.results import IMPORTERS
 
 IMPORTERS["files"] = lambda: import_module("rsvib_torch.io.stack_reading")
 IMPORTERS["figures"] = lambda: import_module("rsvib_torch.report.plots")

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field, SkipValidation
 from pydantic.config import JsonDict
 
-from rsvib_torch.checks.validation import (
+from rsvib_torch.checks.values import (
     Count,
     Extensible,
     NotNegative,

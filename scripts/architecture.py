@@ -32,7 +32,7 @@ LAYERS: tuple[dict[str, str], ...] = (
         "results": "summary, dictionary, files, figures and reasons of all results",
         "options": "type, bounds, default and description of every option",
     },
-    {"checks": "checks of what users give: values, arrays, arguments, groups of options (validation.py)"},
+    {"checks": "checks of what users give: values, groups of options (values.py), arrays, arguments"},
     {
         "numerics": "splines, Fourier transforms, banded systems, tables of fits",
         "files": "durable writes, bounded reads, paths of outputs, free memory",

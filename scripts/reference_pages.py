@@ -16,8 +16,7 @@ import harness
 import typer
 from architecture import table_of_packages
 
-from rsvib_torch.checks.validation import fields_of
-from rsvib_torch.checks.values import members_of
+from rsvib_torch.checks.values import fields_of, members_of
 from rsvib_torch.commands.main import app
 from rsvib_torch.motion.timing import SensorSection
 from rsvib_torch.options import METHOD_OPTIONS, OpticsOptions, RestorationOptions, ToneOptions, WindowOptions

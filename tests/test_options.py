@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import rsvib_torch as rsv
-from rsvib_torch.checks.validation import MistakesError, validate
+from rsvib_torch.checks.values import MistakesError, validate
 from rsvib_torch.options import ToneOptions
 
 

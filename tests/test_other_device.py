@@ -8,7 +8,7 @@ import torch
 from simulated_gpu import SIMULATED_GPU, DeviceError, SimulatedGpuTensor, simulated_gpu
 
 import rsvib_torch as rsv
-from rsvib_torch.execution.precision import full_precision
+from rsvib_torch.execution.parallel import full_precision
 
 SIZE = 128
 TIMING = rsv.SensorTiming(row_time=20.52e-6 * 16, exposure_rows=2, frame_rows=SIZE)

@@ -17,7 +17,7 @@ from torch.nn import functional
 
 from rsvib_torch.checks.arguments import channels_appear_last, check_tensor, checks_arguments
 from rsvib_torch.checks.values import check_choice, check_number, check_whole_number
-from rsvib_torch.execution.precision import full_precision
+from rsvib_torch.execution.parallel import full_precision
 from rsvib_torch.files.reading import Table
 from rsvib_torch.frames.prepare import frames_from_row_order, frames_to_row_order
 from rsvib_torch.imaging import blur_rows, gauss_node_count, trajectory_psf

@@ -19,8 +19,7 @@ from pydantic import ConfigDict, Field, GetPydanticSchema, Strict, TypeAdapter
 from pydantic_core import core_schema
 from torch import Tensor
 
-from rsvib_torch.checks.validation import Number
-from rsvib_torch.checks.values import MAX_NUMBER, check_choice, described, members_of, validated, without_alias
+from rsvib_torch.checks.values import MAX_NUMBER, Number, check_choice, described, members_of, validated, without_alias
 from rsvib_torch.text import one_line, quoted
 
 P = ParamSpec("P")

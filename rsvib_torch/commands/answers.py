@@ -12,7 +12,7 @@ from rsvib_torch import detection, io, stacks
 from rsvib_torch import report as reports
 from rsvib_torch.commands.shared_options import check_new
 from rsvib_torch.commands.terminal import Answer, note, warn, working
-from rsvib_torch.files.atomic import check_writable, write_json
+from rsvib_torch.files.atomic import check_writable
 from rsvib_torch.files.reading import Table
 from rsvib_torch.text import AXES, number_of, printable, wrapped
 
@@ -141,6 +141,10 @@ def steps_after_detection(
         steps.append(next_step("restore the frames", *restore))
     reasons = [reason for of_axis in result.findings for reason in of_axis]
     if any(reason.kind.free_model for reason in reasons):
+        # a run in windows measures vibrations that change, unless the frames agree with another timing
+        if vibration is not None and not any(reason.code.startswith("other_") for reason in reasons):
+            command = ("run", frames, frames.with_name("results"), *settings.arguments)
+            steps.append(next_step("measure a vibration that changes, and restore the frames", *command))
         motion = ("motion", frames, *settings.arguments, "--out", "motion.csv")
         steps.append(next_step("detect a motion that is not a steady vibration", *motion))
     if reasons:
@@ -151,7 +155,7 @@ def steps_after_detection(
 # Files in a folder
 
 OF_DETECTION = ("vibration.json", "tones.csv", "offsets.csv", "offsets.png", "spectrum.csv", "spectrum.png")
-OF_WINDOWS = ("manifest.json", "tones.csv", "windows.json", "windows.png")
+OF_WINDOWS = ("manifest.json", "tones.csv", "windows.png")
 
 
 def check_folder(
@@ -191,15 +195,14 @@ def write_detection(
 
 
 def write_windows(folder: Path, manifest: stacks.StackManifest, pixel_size: float | None = None) -> list[str]:
-    """Write summary, table and figure of windows, warn of failures, and return the names of the files."""
+    """Write table and figure of windows, warn of failures, and return the names of the files."""
     warn_of_failures(manifest)
     with working("drawing the windows"):
-        write_json(folder / "windows.json", {"format": "rsvib windows", "version": 1, **manifest.totals()})
         reports.write_table(folder / "tones.csv", manifest, pixel_size=pixel_size)
         if manifest.gyroscope is not None:  # no tones are searched for
-            return ["windows.json", "tones.csv"]
+            return ["tones.csv"]
         reports.save_figure(manifest.plot(), folder / "windows.png")
-    return ["windows.png", "windows.json", "tones.csv"]
+    return ["windows.png", "tones.csv"]
 
 
 def note_lost(path: Path, names: Sequence[str]) -> None:

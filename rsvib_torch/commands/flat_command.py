@@ -2,21 +2,24 @@
 
 import inspect
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
+from types import NoneType
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 import typer
 from pydantic import Field
+from typer.models import ArgumentInfo
 
-from rsvib_torch.checks.validation import fields_of, options
-from rsvib_torch.checks.values import members_of
+from rsvib_torch.checks.values import fields_of, members_of, options
 from rsvib_torch.commands.terminal import Answer, current_output, error_line, show_answer
 from rsvib_torch.files.reading import Table
 from rsvib_torch.options import COMMAND_LINE
 
 Group = TypeVar("Group")
 _NOT_RELIABLE = 3  # exit code
+_NONE = object()  # value of an option that is stated as "none"
 
 
 def argument(default: object = ..., **form: Any) -> Any:
@@ -67,12 +70,26 @@ class _OutputOptions:
     """Print the traceback of an error."""
 
 
+def _number_or_word(words: Sequence[str], text: str) -> object:
+    """Value of an option that is a number or one of some words."""
+    if text in words:
+        return _NONE if text == "none" else text
+    try:
+        return float(text)
+    except ValueError as error:
+        raise typer.BadParameter(f"expected a number or {' or '.join(words)}, got {text!r}") from error
+
+
 def _parameter(name: str, annotation: object, default: object, form: Table) -> inspect.Parameter:
     """A field as typer reads it; the group checks bounds, and has alternatives such as "auto" that options lack."""
     form = dict(form)
     members = [form.pop("kind")] if "kind" in form else members_of(annotation)
     choices = tuple(choice for member in members if get_origin(member) is Literal for choice in get_args(member))
     plain = [member for member in members if get_origin(member) is not Literal]
+    if choices and float in plain:  # a number, or a word
+        words = (*choices, *(("none",) if NoneType in get_args(annotation) else ()))
+        form.setdefault("parser", partial(_number_or_word, words))
+        form.setdefault("metavar", "|".join(("NUMBER", *words)))
     kind: Any = str if str in plain else plain[0] if plain else type(choices[0])
     kind = Literal[choices] if not plain and kind is str else kind
     option_name = f"--{name.replace('_', '-')}"
@@ -82,6 +99,15 @@ def _parameter(name: str, annotation: object, default: object, form: Table) -> i
     default = False if default is None and kind is bool else default
     kind = Annotated[kind | None if default is None else kind, info]
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
+
+
+def _option_name(parameter: inspect.Parameter) -> str | None:
+    """The option of the command line that states a parameter; None of an argument."""
+    info = get_args(parameter.annotation)[1]
+    if isinstance(info, ArgumentInfo):
+        return None
+    stated = (one for one in (info.default, *(info.param_decls or ())) if str(one).startswith("--"))
+    return next(stated, f"--{parameter.name.replace('_', '-')}")
 
 
 def _parameters(group: type) -> Iterator[tuple[str, inspect.Parameter]]:
@@ -103,6 +129,7 @@ def flat_command(name: str, command: Callable[[Group], Answer]) -> Callable[...,
     """A command as typer calls it: its options are flat, and its answer is printed."""
     (group,) = (parameter.annotation for parameter in inspect.signature(command, eval_str=True).parameters.values())
     fields = list(_parameters(group))
+    names = {one.name: option for _, one in fields if (option := _option_name(one)) is not None}
 
     def flat(**given: object) -> None:
         values: Table = {}
@@ -112,9 +139,14 @@ def flat_command(name: str, command: Callable[[Group], Answer]) -> Callable[...,
                 values[place] = value
             else:
                 is_given = value is not None and (value is not False or parameter.default is None)
-                values.setdefault(place, {}).update({parameter.name: value} if is_given else {})
+                values.setdefault(place, {}).update(
+                    {parameter.name: None if value is _NONE else value} if is_given else {}
+                )
         output = current_output()
         output.as_json, output.quiet = bool(given["as_json"]), bool(given["quiet"])
+        # a configuration file has keys of the same names
+        only = [name for name, value in given.items() if value is not None] if given.get("config") else names
+        output.names = {name: option for name, option in names.items() if name in only}
         answer = command(group(**values))
         show_answer(name, answer)
         required = values.get("require_reliable") or ""

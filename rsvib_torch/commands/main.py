@@ -11,23 +11,21 @@ from typing import Annotated
 import typer
 
 import rsvib_torch
-from rsvib_torch.checks.validation import MistakesError
-from rsvib_torch.commands import stack_commands
-from rsvib_torch.commands.calibrate_command import calibrate
+from rsvib_torch.checks.values import MistakesError
+from rsvib_torch.commands.camera_commands import calibrate, cameras, init
 from rsvib_torch.commands.flat_command import flat_command
-from rsvib_torch.commands.init import cameras, init
 from rsvib_torch.commands.live_command import live_session
-from rsvib_torch.commands.restore_command import restore
 from rsvib_torch.commands.run_stack import run
-from rsvib_torch.commands.terminal import Answer, error_line, print_line, running, warnings_in_one_line
+from rsvib_torch.commands.stack_commands import detect, motion, restore
+from rsvib_torch.commands.terminal import Answer, current_output, error_line, print_line, running, warnings_in_one_line
 
 _COMMANDS: dict[str, Callable[..., Answer]] = {  # in the order of the help
     "init": init,
     "cameras": cameras,
     "run": run,
-    "detect": stack_commands.detect,
+    "detect": detect,
     "restore": restore,
-    "motion": stack_commands.motion,
+    "motion": motion,
     "calibrate": calibrate,
     "live": live_session,
 }
@@ -87,22 +85,22 @@ def run_command(arguments: Sequence[str]) -> int:
     """
     logging.getLogger("tifffile").addHandler(logging.NullHandler())  # damaged files raise an error of this package
     command = typer.main.get_command(app)
-    try:
-        with running(arguments), warnings_in_one_line():
-            try:
-                code = command.main(args=list(arguments) or ["--help"], prog_name="rsvib", standalone_mode=False)
-            except typer.Abort:
-                code = _INTERRUPTED
+    with running(arguments), warnings_in_one_line():
+        try:
+            code = command.main(args=list(arguments) or ["--help"], prog_name="rsvib", standalone_mode=False)
+        except typer.Abort:
+            code = _INTERRUPTED
+        except Exception as error:
+            if "--debug" in arguments:
+                traceback.print_exc()
+            for line in _lines_of(error):
+                error_line(line)
+            return 2
         if code == _INTERRUPTED:
-            kept = "; --resume continues behind the windows that are complete" if "run" in arguments[:1] else ""
-            error_line(f"stopped{kept}")
-        return code if isinstance(code, int) else 0
-    except Exception as error:
-        if "--debug" in arguments:
-            traceback.print_exc()
-        for line in _lines_of(error):
-            error_line(line)
-    return 2
+            work = current_output().work
+            is_kept = work is not None and work.exists()
+            error_line("stopped; --resume continues behind the windows that are complete" if is_kept else "stopped")
+    return code if isinstance(code, int) else 0
 
 
 def _lines_of(error: Exception) -> Sequence[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,7 +10,7 @@ import rsvib_torch
 from rsvib_torch import detection, io, stacks, video
 from rsvib_torch import frames as preparation
 from rsvib_torch import report as reports
-from rsvib_torch.checks.validation import options
+from rsvib_torch.checks.values import options
 from rsvib_torch.commands import answers
 from rsvib_torch.commands.flat_command import Given, argument
 from rsvib_torch.commands.shared_options import PixelSizeOptions, RestorationCommand, VerdictOptions
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from rsvib_torch.detection import DetectionResult
 
 
-_RESULTS = (*answers.OF_DETECTION, *answers.OF_WINDOWS, "restoration.json", "before_after.png", "report.html")
+_RESULTS = (*answers.OF_DETECTION, *answers.OF_WINDOWS, "before_after.png", "report.html")
 _PROCESSING = ("resume", "compression", "memory", "workers")
 
 
@@ -75,16 +75,23 @@ def run(given: RunOptions) -> Answer:
     settings, frames, out, output = given.settings, given.frames, given.out, _name_of_output(given)
     replaces = given.overwrite or "resume" in given.processing
     answers.check_folder(out, _RESULTS, replaces, given.inputs, out / output)
-    info, scale, restoration = given.planned_restoration(given.restoration)
+    current_output().work = stacks.work_folder(out / output)
+    info, common = given.info, given.of_stack
     print_notes(info, settings)
     chosen = WindowOptions(**{**settings.stack, **given.windows})
-    common = given.of_stack(scale, restoration)
     # 1. Process windows, or a video of more than one window from frame to frame.
     followed = bool(given.moved) or (given.video and io.is_video(frames) and info.shape[0] > chosen.window)
+    result = _process_video(given, out / output, common) if followed else _process(given, out / output, common, chosen)
+    manifest = stacks.read_manifest(result.manifest)
+    if result.resumed == result.windows and (out / "tones.csv").exists() and not given.report:
+        answer = answers.windows_answer(f"Vibration in {frames.name}", manifest, result)
+        answer.files += [out / name for name in dict.fromkeys((output, *_RESULTS)) if (out / name).exists()]
+        return answer
     if followed:
-        result, shown = _process_video(given, out / output, info, common)
+        shown = _show_video(given, out / output, info, manifest)
     else:
-        result, shown = _process_windows(given, out / output, info, common, chosen)
+        shown = _show_window(given, result, info, common | _windows(given, chosen), manifest)
+    answers.note_lost(out / output, () if followed else result.not_kept)
     # 2. Figure, tables and page.
     with whole_folder(out) as folder:
         drawn = []
@@ -99,7 +106,8 @@ def run(given: RunOptions) -> Answer:
             answers.check_folder(out, pages, overwrite=True, inputs=given.inputs)
             names = list(dict.fromkeys(pages + names))  # the page shows the curves of offsets.png as well
         elif result.restored:
-            step = f"write a page with all figures:\n  {current_output().command} --resume --report"
+            command = (current_output().command or "").replace(" --resume", "")
+            step = f"write a page with all figures:\n  {command} --resume --report"
             answer.next_steps.insert(0, step)
     if followed:
         _describe_video(answer, shown.stored, result)
@@ -136,7 +144,6 @@ class _Shown:
     stored: stacks.StackManifest  # all windows
     detection: DetectionResult | None = None  # of a steady vibration
     restoration: stacks.RestoredFrames | None = None  # its verdict
-    options: Table = field(default_factory=dict)  # of ``restore``
 
     @property
     def windows(self) -> stacks.StackManifest | None:
@@ -144,71 +151,77 @@ class _Shown:
         return None if len(self.stored.windows) == 1 and self.detection is not None else self.stored
 
 
-def _process_windows(
-    given: RunOptions, restored: Path, info: io.StackInfo, common: Table, chosen: WindowOptions
-) -> tuple[stacks.StackReport, _Shown]:
-    """Process a stack in windows; the first one is shown."""
-    settings, frames, processing = given.settings, given.frames, given.processing
-    common = common | {"window": chosen.window, "force": given.force}
-    common["detection"] = settings.detection
-    manifest, counts = given.out / "manifest.json", info.shape[0] > chosen.window
-    of_run = common | processing | {"manifest": manifest}
-    with working(f"restoring {frames.name}", counts=counts) as progress:
+def _windows(given: RunOptions, chosen: WindowOptions) -> Table:
+    """Options of a run in windows."""
+    return {"window": chosen.window, "force": given.force, "detection": given.settings.detection}
+
+
+def _process(given: RunOptions, restored: Path, common: Table, chosen: WindowOptions) -> stacks.StackReport:
+    """Process a stack in windows."""
+    of_run = common | _windows(given, chosen) | given.processing | {"manifest": given.out / "manifest.json"}
+    counts = given.info.shape[0] > chosen.window
+    with working(f"restoring {given.frames.name}", counts=counts) as progress:
         of_run["progress"] = progress if counts else None
-        result = stacks.process_stack(frames, restored, settings.timing, **of_run)
-    first = result.first
-    if first is None:  # the run was complete before, or its first window was
-        resources = {name: value for name, value in processing.items() if name in ("memory", "workers")}
-        first = next(iter(stacks.iterate_stack(frames, settings.timing, **common, **resources)))
+        return stacks.process_stack(given.frames, restored, given.settings.timing, **of_run)
+
+
+def _process_video(given: RunOptions, restored: Path, common: Table) -> stacks.StackReport:
+    """Process a video from frame to frame."""
+    restoration = dict(common["restoration"])
+    if {**given.settings.restoration, **given.restoration}.get("saturation") is None:
+        restoration.pop("saturation", None)  # that of integer formats
+    of_run = common | {"restoration": restoration} | given.moved | given.windows | given.processing
+    of_run["manifest"] = given.out / "manifest.json"
+    with working(f"restoring {given.frames.name}", counts=True) as progress:
+        return video.process_video(given.frames, restored, given.settings.timing, **of_run, progress=progress)
+
+
+def _show_window(
+    given: RunOptions, result: stacks.StackReport, info: io.StackInfo, options: Table, stored: stacks.StackManifest
+) -> _Shown:
+    """Frames of the first window, which is computed with these options if it was complete before."""
+    settings, frames, first = given.settings, given.frames, result.first
+    if first is None:
+        resources = {name: value for name, value in given.processing.items() if name in ("memory", "workers")}
+        first = next(iter(stacks.iterate_stack(frames, settings.timing, **options, **resources)))
     if result.bad_frames:
         warn(f"{number_of(result.bad_frames, 'frame')} could not be used: see manifest.json")
-    answers.note_lost(restored, result.not_kept)
-    after, options = first.frames.cpu(), common["restoration"]
+    after, restoration = first.frames.cpu(), options["restoration"]
     # the page shows all frames of the window, the figure one of them: of a joint image, that in the middle
     indices = first.indices or [index for index in first.window.written if index not in first.bad_frames]
     if not given.report:
         middle = 0 if first.indices else len(indices) // 2
         indices, after = indices[middle : middle + 1], after[:1]
-    before = read_frames(frames, indices, common["full_scale"]) if len(after) else after
-    if len(before) and options.get("mosaic") is not None:
-        before = preparation.colour_frames(before, options["mosaic"])
+    before = read_frames(frames, indices, options["full_scale"]) if len(after) else after
+    if len(before) and restoration.get("mosaic") is not None:
+        before = preparation.colour_frames(before, restoration["mosaic"])
     found = first.detection if isinstance(first.detection, detection.DetectionResult) else None
     timing = io.timing_from_first_frame(settings.timing, info)
     if found is not None and found.timing is not None and result.windows > 1:
         timing = found.timing
-    shown = (before, after, next(iter(indices), 0), first.restored, timing, stacks.read_manifest(manifest))
-    return result, _Shown(*shown, detection=found, restoration=first.restoration, options=options)
+    shown = (before, after, next(iter(indices), 0), first.restored, timing, stored)
+    return _Shown(*shown, detection=found, restoration=first.restoration)
 
 
-def _process_video(
-    given: RunOptions, restored: Path, info: io.StackInfo, common: Table
-) -> tuple[stacks.StackReport, _Shown]:
-    """Process a video from frame to frame; two frames near its begin are shown."""
-    settings, frames, restoration = given.settings, given.frames, common["restoration"]
-    if {**settings.restoration, **given.restoration}.get("saturation") is None:
-        restoration.pop("saturation", None)  # that of integer formats
-    manifest = given.out / "manifest.json"
-    of_run = common | given.moved | given.windows | given.processing | {"manifest": manifest}
-    with working(f"restoring {frames.name}", counts=True) as progress:
-        result = video.process_video(frames, restored, settings.timing, **of_run, progress=progress)
-    stored = stacks.read_manifest(manifest)
+def _show_video(given: RunOptions, restored: Path, info: io.StackInfo, stored: stacks.StackManifest) -> _Shown:
+    """Two frames near the begin of a video."""
     bad = stored.bad_frames
     pairs = (number for number in range(info.shape[0] - 1) if str(number) not in bad and str(number + 1) not in bad)
     first = min(pairs, key=lambda number: abs(number - 8), default=None)  # earlier frames must be decoded as well
     indices = () if first is None else (first, first + 1)  # no two neighbours could be used
-    before = read_frames(frames, indices, stored.settings["full_scale"])
+    before = read_frames(given.frames, indices, stored.settings["full_scale"])
     if stored.margins is not None:
         before = video.Margins(**stored.margins).cut(before)
     after = read_frames(restored, indices, None)
-    return result, _Shown(before, after, first or 0, result.restored > 0, settings.timing, stored)
+    is_restored = any(record.frames == "restored" for record in stored.windows)
+    return _Shown(before, after, first or 0, is_restored, given.settings.timing, stored)
 
 
 def _describe(folder: Path, given: RunOptions, result: stacks.StackReport, shown: _Shown, names: list[str]) -> Answer:
     """Write the tables and figures of one vibration of all frames, or of the windows; their names are added."""
     frames, found, judged = given.frames, shown.detection, shown.restoration
     if shown.windows is None and found is not None and judged is not None:
-        reports.write_restoration(folder / "restoration.json", judged, shown.options, result.not_kept)
-        names += [*answers.write_detection(folder, found, shown.timing, given.pixel_size), "restoration.json"]
+        names += answers.write_detection(folder, found, shown.timing, given.pixel_size)
         answers.warn_of_restoration(judged)
         answer = answers.stack_answer(frames, found, given.pixel_size, judged, given.info.shape[0])
         answer.next_steps = answers.steps_after_detection(found, frames, given.settings)

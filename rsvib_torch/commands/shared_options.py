@@ -14,7 +14,7 @@ import typer
 from rsvib_torch import frames as preparation
 from rsvib_torch import gyroscope, io
 from rsvib_torch import restoration as restore
-from rsvib_torch.checks.validation import options
+from rsvib_torch.checks.values import options
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.terminal import note
 from rsvib_torch.config import Config, read_config
@@ -87,23 +87,6 @@ SENSOR_FORMS: dict[str, Table] = {
 
 
 @options
-class DeviceOptions:
-    """Where it is computed."""
-
-    device: DeviceName = "auto"
-    """Device for the computation; auto uses a GPU if there is one."""
-
-    @cached_property
-    def torch_device(self) -> "torch.device":
-        """The device."""
-        import torch  # noqa: PLC0415
-
-        if self.device == "cuda" and not torch.cuda.is_available():
-            raise ValueError("--device cuda: no CUDA device is available; use auto or cpu")
-        return torch.device("cuda" if self.device != "cpu" and torch.cuda.is_available() else "cpu")
-
-
-@options
 class CameraOptions:
     """The camera, and what all commands have that use one."""
 
@@ -148,12 +131,15 @@ class CameraOptions:
 
 
 @options
-class StackCommand(CameraOptions, DeviceOptions):
+class StackCommand(CameraOptions):
     """A command that reads a stack of frames."""
 
     frames: Path = argument()
     """Stack of frames: TIFF, .npy, HDF5, video, or a folder of PNG, TIFF or JPEG files. NAME[100:200] are
     its frames 100 to 199, from the first of which times count."""
+
+    device: DeviceName = "auto"
+    """Device for the computation; auto uses a GPU if there is one."""
 
     @cached_property
     def settings(self) -> Config:
@@ -181,14 +167,14 @@ class StackCommand(CameraOptions, DeviceOptions):
         """Files that are read."""
         return [*io.stack_files(self.frames), *([] if self.config is None else [self.config])]
 
-    def of_stack(self, scale: float | None, restoration: Table) -> Table:
-        """Options that the functions for stacks have in common."""
-        return {"full_scale": scale, "restoration": restoration, "device": str(self.torch_device)}
+    @cached_property
+    def torch_device(self) -> "torch.device":
+        """The device."""
+        import torch  # noqa: PLC0415
 
-    def planned_restoration(self, given: Mapping[str, object]) -> "tuple[StackInfo, float | None, Table]":
-        """What the file states, its full scale, and options of ``restore``: configured, replaced by those ``given``."""
-        options = _restoration_options(self.info, self.scale, dict(self.settings.restoration), dict(given))
-        return self.info, self.scale, options
+        if self.device == "cuda" and not torch.cuda.is_available():
+            raise ValueError("--device cuda: no CUDA device is available; use auto or cpu")
+        return torch.device("cuda" if self.device != "cpu" and torch.cuda.is_available() else "cpu")
 
 
 @options
@@ -211,6 +197,42 @@ class RestorationCommand(StackCommand):
     ]
     force: bool = False
     """Write the restored frames even if they are judged no better than the input."""
+
+    @cached_property
+    def of_stack(self) -> Table:
+        """Options of the functions for stacks: full scale, device, and options of ``restore``."""
+        return {"full_scale": self.scale, "restoration": self._chosen(), "device": str(self.torch_device)}
+
+    def _chosen(self) -> Table:
+        """Options of ``restore``: those of the configuration file, replaced by those of the command line."""
+        options, given, info, full_scale = (
+            dict(self.settings.restoration),
+            dict(self.restoration),
+            self.info,
+            self.scale,
+        )
+        method: str = (options | given).get("method", "exact")
+        if method != options.get("method", "exact"):  # other options belong to the configured method
+            kept = ("saturation", *method_options(method))
+            options = {name: value for name, value in options.items() if name in kept}
+        if "joint" in given:
+            if given["joint"] != "all" and not (given["joint"].isdecimal() and int(given["joint"]) >= 1):
+                raise ValueError(f"--joint must be 'all' or a number of frames, got {given['joint']!r}")
+            given["joint"] = given["joint"] == "all" or int(given["joint"])
+            if given["joint"] > info.shape[0]:
+                more = f"--joint {given['joint']} exceeds the number of frames, {info.shape[0]}"
+                raise ValueError(f"{more}; 'all' uses all")
+        options |= given
+        checked = RestorationOptions(**options)
+        if options.get("saturation") == "auto":
+            del options["saturation"]
+        level = options.get("saturation", full_scale)  # None: no pixels are saturated
+        if info.is_integer and full_scale is not None and level is not None:  # of frames whose full scale is 1
+            options["saturation"] = level / full_scale
+        if checked.mosaic is not None:
+            preparation.check_mosaic(checked.mosaic, info.shape)
+        restore.check_optics(checked.optics)
+        return options
 
 
 @options
@@ -263,12 +285,15 @@ def stated_exposure(path: Path) -> float | None:
 def check_new(
     paths: Iterable[Path], overwrite: bool, inputs: Iterable[Path | None], *, folder: Path | None = None
 ) -> None:
-    """Raise an error if results would replace an input, or exist and must not be replaced.
+    """Raise an error if an input is missing, or if results would replace one, or exist and must not be replaced.
 
     Of folders, which are written as a whole, an empty one may exist. ``folder`` is as in ``check_outputs``.
     """
-    paths = list(paths)
-    check_outputs(paths, [path for path in inputs if path is not None], folder=folder)
+    paths, sources = list(paths), [path for path in inputs if path is not None]
+    missing = next((path for path in sources if not path.exists()), None)
+    if missing is not None:
+        raise FileNotFoundError(f"{missing} does not exist")
+    check_outputs(paths, sources, folder=folder)
     existing = [path for path in paths if os.path.lexists(path) and not (path.is_dir() and not any(path.iterdir()))]
     if existing and not overwrite:
         found = f"results exist already in {existing[0].parent}: {', '.join(path.name for path in existing)}"
@@ -279,25 +304,3 @@ def check_file(path: Path, overwrite: bool, inputs: Iterable[Path | None]) -> No
     """``check_new`` for one file, which must be writable."""
     check_new([path], overwrite, inputs)
     check_writable(path)
-
-
-def _restoration_options(info: "StackInfo", full_scale: float | None, options: Table, given: Table) -> Table:
-    """Options of ``restore``: those of the configuration file, replaced by those ``given`` on the command line."""
-    method: str = (options | given).get("method", "exact")
-    if method != options.get("method", "exact"):  # other options belong to the configured method
-        options = {name: value for name, value in options.items() if name in ("saturation", *method_options(method))}
-    if "joint" in given:
-        if given["joint"] != "all" and not (given["joint"].isdecimal() and int(given["joint"]) >= 1):
-            raise ValueError(f"--joint must be 'all' or a number of frames, got {given['joint']!r}")
-        given["joint"] = given["joint"] == "all" or int(given["joint"])
-    options |= given
-    checked = RestorationOptions(**options)
-    if options.get("saturation") == "auto":
-        del options["saturation"]
-    if info.is_integer and full_scale is not None:  # of frames whose full scale is 1
-        options["saturation"] = (options.get("saturation") or full_scale) / full_scale
-    if checked.mosaic is not None:
-        preparation.check_mosaic(checked.mosaic, info.shape)
-    if checked.optics is not None:
-        restore.check_optics(checked.optics)
-    return options

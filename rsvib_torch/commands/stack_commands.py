@@ -1,28 +1,30 @@
-"""The commands ``detect`` and ``motion``, and how all commands read frames."""
+"""The commands ``detect``, ``motion`` and ``restore``, and how all commands read frames."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import rsvib_torch
 from rsvib_torch import detection, io, stacks
 from rsvib_torch import report as reports
-from rsvib_torch.checks.validation import options
+from rsvib_torch.checks.values import options
 from rsvib_torch.commands import answers
 from rsvib_torch.commands import shared_options as shared
-from rsvib_torch.commands.flat_command import Given, option
-from rsvib_torch.commands.terminal import Answer, note, working
+from rsvib_torch.commands.flat_command import Given, argument, option
+from rsvib_torch.commands.terminal import Answer, current_output, note, warn, working
 from rsvib_torch.files.atomic import whole_folder
 from rsvib_torch.files.reading import Table
-from rsvib_torch.options import FreeMotionOptions
+from rsvib_torch.options import FreeMotionOptions, MotionUnit, ProcessStackOptions
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from rsvib_torch.config import Config
+    from rsvib_torch.io.stack_info import StackInfo
 
 
 def load(given: shared.StackCommand) -> tuple[Tensor, rsvib_torch.SensorTiming]:
@@ -113,3 +115,139 @@ def motion(given: MotionOptions) -> Answer:
         [answers.next_step("restore the frames", *restore)] * bool(result.reliable.any()),
         answers.verdicts([result]),
     )
+
+
+@options
+class RestoreOptions(shared.RestorationCommand):
+    """Options of ``restore``."""
+
+    restored: Path = argument()
+    """Stack to write, with the data type and full scale of the input. The extension selects the format; .mp4 and .mkv
+    are videos with the time stamps and the sound of the input."""
+    vibration: Path | None = None
+    """The vibration.json written by detect or run."""
+    motion: Path | None = None
+    """In place of a vibration: CSV file with the columns time in s, x and y; or, without --unit, the angular rates of a
+    gyroscope: a gyroflow log (.gcsv), a GoPro video (.mp4), or CSV with three rates whose names state the unit."""
+    unit: MotionUnit | None = option(None, show_default="the rates of a gyroscope")
+    """Unit of x and y: px, an angle, or an angular rate."""
+    focal_length: float | None = option(None, show_default="for a gyroscope, estimated from the frames")
+    """Focal length in px; required for angles and angular rates."""
+    lens_profile: Path | None = option(None, show_default="a lens without distortion")
+    """With a gyroscope: lens profile of Gyroflow (JSON)."""
+    offset: float | None = option(None, show_default="estimated from the frames")
+    """With --unit: time of the recording, in s, at the exposure start of the first row of frame 0."""
+    ignore: list[str] | None = option(None, metavar="ROWS[,COLUMNS]", show_default="all rows count")
+    """Rows of the frames, or a part of them, that do not count in the comparison with the recording, for example 400:
+    for a dashboard below row 400, or :60,500: for a sign in a corner; may be given several times."""
+    processing: Annotated[
+        Table,
+        Given(
+            ProcessStackOptions,
+            ("memory", "workers", "resume"),
+            forms={
+                "window": {
+                    "text": "With --motion, largest number of frames that are restored and judged together.",
+                    "show_default": "from the configuration, or 8",
+                }
+            },
+        ),
+    ]
+
+    @property
+    def manifest(self) -> Path:
+        """What was restored in each window."""
+        return self.restored.with_name(f"{self.restored.name}.manifest.json")
+
+
+def restore(given: RestoreOptions) -> Answer:
+    """Restore a stack of frames with a detected vibration or a recorded motion.
+
+    The offset of a recorded motion, of a gyroscope or an attitude sensor, is stated (--offset), or found by the offsets
+    of rows between the frames: a motion that does not explain them is refused. If the restored frames are judged no
+    better than the input, the input is written unchanged. --force restores in both cases.
+    """
+    settings, frames, vibration = given.settings, given.frames, given.vibration
+    outputs = [*io.stack_files(given.restored), given.manifest]
+    replaces = given.overwrite or "resume" in given.processing
+    shared.check_new(outputs, replaces, [*given.inputs, vibration, given.motion, given.lens_profile])
+    current_output().work = stacks.work_folder(given.restored)
+    info, scale, chosen = given.info, given.scale, given.of_stack["restoration"]
+    shape = info.restored_as(chosen.get("scale", 1), chosen.get("mosaic")).shape
+    shape = (1, *shape[1:]) if chosen.get("joint") is True else shape
+    io.check_stack_target(given.restored, shape, dtype=info.dtype, full_scale=scale, like=info)
+    of_run = given.of_stack | {"force": given.force} | given.processing
+    # 1. The vibration of all frames, or the motion on the clock of the frames.
+    if vibration is not None and given.motion is None:
+        detected = reports.read_vibration(vibration, io.timing_from_first_frame(settings.timing, info))
+        stacks.check_stack_fits(info, chosen, on_gpu=given.torch_device.type != "cpu")
+        print_notes(info, settings)
+        of_run |= {"given": [detected], "window": max(2, info.shape[0])}
+        answer = Answer({"Vibration": [detected.summary()]}, {"detection": answers.detection_data(detected)})
+    elif given.motion is not None and vibration is None:
+        answer = Answer({}, {"alignment": None})
+        of_run["motion"] = _motion_of_frames(given, given.motion, replace(info, full_scale=scale), answer)
+        of_run["window"] = given.processing.get("window", settings.stack.get("window", 8))
+    else:
+        raise ValueError("give --vibration FILE, or --motion FILE of a recording")
+    # 2. Restoration in windows.
+    counts = info.shape[0] > of_run["window"]
+    with working(f"restoring {frames.name}", counts=counts) as progress:
+        of_run["progress"] = progress if counts else None
+        run = stacks.process_stack(frames, given.restored, settings.timing, **of_run)
+    answer.results["Restoration"], answer.data["restoration"] = answers.restoration_of(run, given.restored)
+    answer.files += [given.restored, given.manifest]
+    return answer
+
+
+def _motion_of_frames(given: RestoreOptions, path: Path, info: StackInfo, answer: Answer) -> rsvib_torch.FreeMotion:
+    """A recorded motion on the clock of the frames, which is stated or estimated."""
+    recorded, timing = _recorded(given, path), given.settings.timing
+    ignore = stacks.mask_of_regions(given.ignore or (), (info.shape[-2], info.shape[-1]))
+    print_notes(info, given.settings)
+    if isinstance(recorded, rsvib_torch.FreeMotion) and given.offset is not None:
+        return _placed(given, recorded, timing, given.offset)
+    camera = _camera(given)
+    with working("aligning the recording"):
+        found = stacks.align_stack(given.frames, info, timing, recorded, camera=camera, ignore=ignore)
+    answer.results["Recording on the clock of the frames"] = [found.summary()]
+    answer.data["alignment"] = answers.without_curves(found)
+    if found.reasons and not given.force:
+        raise ValueError(f"{path}: {'; '.join(found.reasons)}; --force restores with it nevertheless")
+    for reason in found.reasons:
+        warn(reason)
+    return found.motion
+
+
+def _recorded(given: RestoreOptions, path: Path) -> rsvib_torch.FreeMotion | rsvib_torch.AngularRates:
+    """The motion of a CSV file, or the rates of a gyroscope."""
+    if given.unit is not None:
+        if given.lens_profile is not None:
+            raise ValueError("--lens-profile is for a gyroscope, without --unit")
+        return rsvib_torch.read_motion(path, unit=given.unit, focal_length=given.focal_length)
+    if given.offset is not None:
+        raise ValueError("--offset needs --unit; axes and clock of a gyroscope are estimated from the frames")
+    if given.lens_profile is not None and given.focal_length is not None:
+        raise ValueError("--lens-profile and --focal-length both state the focal length: give one of them")
+    return rsvib_torch.read_gyroscope(path)
+
+
+def _camera(given: RestoreOptions) -> rsvib_torch.Camera | None:
+    """The stated lens of a gyroscope."""
+    if given.lens_profile is not None:
+        return rsvib_torch.Camera.from_gyroflow(given.lens_profile, given.info.shape[-1], given.info.shape[-2])
+    return None if given.unit is not None or given.focal_length is None else rsvib_torch.Camera(given.focal_length)
+
+
+def _placed(
+    given: RestoreOptions, recorded: rsvib_torch.FreeMotion, timing: rsvib_torch.SensorTiming, offset: float
+) -> rsvib_torch.FreeMotion:
+    """A recording whose clock is stated, if it covers the frames."""
+    info, placed = given.info, recorded.retimed(offset)
+    starts = io.timing_from_first_frame(timing, info).frame_starts(info.shape[0])
+    readout = info.shape[int(timing.scan_axis)] * timing.row_time + timing.exposure_time
+    last = float(starts[-1] - starts[0]) + readout
+    if placed.start > 1e-9 or placed.end < last - 1e-9:  # s; rounding of the offset
+        needed = f"the frames need {offset:.6g} to {offset + last:.6g} s"
+        raise ValueError(f"{given.motion}: covers {recorded.start:.6g} to {recorded.end:.6g} s, {needed}")
+    return placed

@@ -1,5 +1,6 @@
 """Terminal output: progress, the answer of a command as text or JSON, and warnings and errors in one line each."""
 
+import re
 import shlex
 import textwrap
 import warnings
@@ -44,6 +45,8 @@ class Output:
     command: str | None = None  # the command line, as it can be copied into a shell; None outside of the program
     as_json: bool = False  # print nothing but the answer, as JSON
     quiet: bool = False  # print no answer and no progress
+    names: dict[str, str] = field(default_factory=dict)  # options by the arguments of Python that they stand for
+    work: Path | None = None  # folder with the complete windows of an interrupted run
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
@@ -107,11 +110,19 @@ def error_line(message: str, kind: str = "error") -> None:
     Control codes are escaped, and long texts are shortened. If nobody reads them, as after the end of a terminal, the
     command continues.
     """
-    message = shortened(message)
+    message = shortened(_with_options(message))
     if kind == "warning":
         _outputs[-1].warnings.append(message)
     with suppress(OSError):
         typer.echo(f"{typer.style(f'rsvib: {kind}:', bold=True)} {printable(message)}", err=True)
+
+
+def _with_options(message: str) -> str:
+    """A message with the options of the running command in place of the arguments of Python."""
+    for name, option in _outputs[-1].names.items():
+        pattern = rf"\b{name}\b" if "_" in name else rf"^{name}\b(?= must )"  # other names are English words
+        message = re.sub(pattern, option, message)
+    return message
 
 
 def warn(message: str) -> None:

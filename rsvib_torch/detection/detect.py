@@ -10,8 +10,7 @@ from rsvib_torch.detection.pipeline import METHODS, DetectionOptions
 from rsvib_torch.detection.result import DetectionResult
 from rsvib_torch.detection.strips import camera_in_row_order
 from rsvib_torch.detection.tones.fit import MotionModel
-from rsvib_torch.execution.parallel import threads_for
-from rsvib_torch.execution.precision import full_precision, without_gradients
+from rsvib_torch.execution.parallel import full_precision, threads_for, without_gradients
 from rsvib_torch.frames.entry_points import TimedModule, frames_options, module_options
 from rsvib_torch.frames.prepare import grey_frames
 from rsvib_torch.motion.timing import SensorTiming

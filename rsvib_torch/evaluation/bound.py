@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.checks.arguments import check_images, checks_arguments
-from rsvib_torch.checks.validation import Positive
+from rsvib_torch.checks.values import Positive
 from rsvib_torch.frames.prepare import frames_to_row_order
 from rsvib_torch.imaging import exposure_nodes, rows_showing, simulate_frames
 from rsvib_torch.motion.camera import displacement_factors

@@ -8,7 +8,7 @@ from pydantic import Field
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import FramesLike, as_tensor, checks_arguments
-from rsvib_torch.checks.validation import Positive
+from rsvib_torch.checks.values import Positive
 
 _Rim = Annotated[int, Field(ge=0)]
 

@@ -17,8 +17,7 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from rsvib_torch.checks.arguments import checks_arguments
-from rsvib_torch.checks.validation import Count
-from rsvib_torch.checks.values import check_single
+from rsvib_torch.checks.values import Count, check_single
 from rsvib_torch.files.atomic import whole_file
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming

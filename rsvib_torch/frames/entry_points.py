@@ -16,12 +16,12 @@ import torch
 from torch import Tensor, nn
 
 from rsvib_torch.checks.arguments import FramesLike, FramesOrFiles, PathLike, checks_arguments
-from rsvib_torch.checks.validation import fields_of, flat_options
-from rsvib_torch.execution.precision import outside_graphs
+from rsvib_torch.checks.values import fields_of, flat_options
+from rsvib_torch.execution.parallel import outside_graphs
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming, check_timing
-from rsvib_torch.results.higher_packages import IMPORTERS
+from rsvib_torch.results import IMPORTERS
 
 
 class LoadedFrames(NamedTuple):

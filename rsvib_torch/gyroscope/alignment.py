@@ -18,7 +18,7 @@ from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.grouped_frames import grouped_frames
 from rsvib_torch.detection.shapes.free import record_of, residual_of_motion, rms_motion, start_of_stack
 from rsvib_torch.detection.verdict import recording_reasons
-from rsvib_torch.execution.precision import full_precision, without_gradients
+from rsvib_torch.execution.parallel import full_precision, without_gradients
 from rsvib_torch.frames.entry_points import entry_point
 from rsvib_torch.frames.prepare import (
     frames_from_row_order,

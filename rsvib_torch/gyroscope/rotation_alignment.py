@@ -7,9 +7,8 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from rsvib_torch.checks.validation import Number
-from rsvib_torch.checks.validation import options as option_group
-from rsvib_torch.checks.values import check_number
+from rsvib_torch.checks.values import Number, check_number
+from rsvib_torch.checks.values import options as option_group
 from rsvib_torch.detection.verdict import recording_reasons
 from rsvib_torch.gyroscope.corner_tracks import CornerTracks
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, orientation_matrix

@@ -11,8 +11,7 @@ from pydantic import Field
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import as_numbers, check_broadcast, check_images, check_pixels, checked_methods
-from rsvib_torch.checks.validation import NotNegative, Positive, options
-from rsvib_torch.checks.values import check_number, described
+from rsvib_torch.checks.values import NotNegative, Positive, check_number, described, options
 from rsvib_torch.options import OpticsOptions
 
 _LEAST_RESPONSE = 0.1  # of the camera, below which the gain does not increase: 0.02 and 0.2 lose up to 5 and 3 dB

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import check_broadcast, checked_methods
-from rsvib_torch.checks.validation import read_json
-from rsvib_torch.checks.values import check_number, check_whole_number
+from rsvib_torch.checks.values import check_number, check_whole_number, read_json
 from rsvib_torch.text import quoted
 
 _NEWTON_STEPS = 8  # of the inverse of the distortion; quadratic convergence, 1e-13 after 6 steps for 60 degrees

@@ -9,8 +9,7 @@ from dataclasses import replace
 from functools import cache
 from importlib.resources import files
 
-from rsvib_torch.checks.validation import options
-from rsvib_torch.checks.values import check_number, check_whole_number, described
+from rsvib_torch.checks.values import check_number, check_whole_number, described, options
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.text import measured_text, number_of, quoted
 

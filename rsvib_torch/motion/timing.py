@@ -15,8 +15,15 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from rsvib_torch.checks.validation import Positive, options, validate
-from rsvib_torch.checks.values import check_choice, check_number, check_whole_number, described
+from rsvib_torch.checks.values import (
+    Positive,
+    check_choice,
+    check_number,
+    check_whole_number,
+    described,
+    options,
+    validate,
+)
 from rsvib_torch.files.reading import Table, read_toml
 
 if TYPE_CHECKING:

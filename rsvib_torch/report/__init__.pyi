@@ -12,5 +12,4 @@ from .results import read_vibration as read_vibration
 from .results import restoration_data as restoration_data
 from .results import write_columns as write_columns
 from .results import write_offsets as write_offsets
-from .results import write_restoration as write_restoration
 from .results import write_table as write_table

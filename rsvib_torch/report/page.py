@@ -20,7 +20,7 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, blind_frequencies
 from rsvib_torch.report import plots
 from rsvib_torch.restoration import RestorationVerdict, trusted_vibration
-from rsvib_torch.results.result_files import figure_png
+from rsvib_torch.results.presentation import figure_png
 from rsvib_torch.stacks import StackManifest
 from rsvib_torch.text import data_uri
 

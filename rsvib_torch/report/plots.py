@@ -19,8 +19,7 @@ from torch.nn import functional
 
 from rsvib_torch import detection, gyroscope
 from rsvib_torch.checks.arguments import check_shapes, checks_arguments
-from rsvib_torch.checks.validation import Count
-from rsvib_torch.checks.values import check_single
+from rsvib_torch.checks.values import Count, check_single
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.detection.spectrum import SMALLEST_SHOWN
 from rsvib_torch.evaluation import MtfCurve
@@ -36,8 +35,7 @@ from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.numerics.tables import Array, true_runs
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.restoration import RestorationVerdict
-from rsvib_torch.results.presentation import AXIS_NAMES, AXIS_UNITS, FIGURES
-from rsvib_torch.results.result_files import figure_png
+from rsvib_torch.results.presentation import AXIS_NAMES, AXIS_UNITS, FIGURES, figure_png
 from rsvib_torch.stacks import StackManifest
 from rsvib_torch.text import measured_text
 

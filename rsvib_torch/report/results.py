@@ -1,25 +1,22 @@
-"""Result files: ``vibration.json``, ``offsets.csv``, ``restoration.json`` and tables."""
+"""Result files: ``vibration.json``, ``offsets.csv`` and tables."""
 
 import csv
 import math
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
-from torch import Tensor
 
 from rsvib_torch.checks.arguments import checks_arguments
-from rsvib_torch.checks.validation import read_json
-from rsvib_torch.checks.values import check_single
+from rsvib_torch.checks.values import check_single, read_json
 from rsvib_torch.detection import DetectionResult, MotionDetection
-from rsvib_torch.files.atomic import whole_file, write_json
+from rsvib_torch.files.atomic import whole_file
 from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.results.presentation import Result, plain_values
-from rsvib_torch.results.result_files import result_of
+from rsvib_torch.results.presentation import Result, plain_values, result_of
 from rsvib_torch.stacks import RestoredFrames
 from rsvib_torch.text import quoted
 
@@ -152,20 +149,3 @@ def restoration_data(result: RestoredFrames) -> Table:
         "predicted_gain_db": None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),
         "summary": None if verdict is None else verdict.sentence,
     }
-
-
-def write_restoration(
-    path: str | os.PathLike[str], result: RestoredFrames, options: Table, not_kept: Sequence[str] = ()
-) -> None:
-    """Write whether frames were restored, with which options of ``restore``, and whether that helped, as JSON.
-
-    ``not_kept`` names metadata of the input that the output does not contain.
-    """
-    verdict = result.verdict
-    content: Table = {"format": "rsvib restoration", "version": 1, "options": options}
-    content |= {**restoration_data(result), "not_kept": list(not_kept)}
-    if verdict is not None:
-        pairs = {name: plain_values(value) for name, value in vars(verdict).items() if isinstance(value, Tensor)}
-        content["pairs"] = {**pairs, "outcome": list(verdict.outcome), "findings": plain_values(verdict.findings)}
-        content["units"] = {"misfit_before": "px", "misfit_after": "px", "resolution": "px", "predicted_gain": "dB"}
-    write_json(path, content)

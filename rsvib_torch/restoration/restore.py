@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import ArrayLike, FramesOrFiles
-from rsvib_torch.execution.parallel import threads_for
-from rsvib_torch.execution.precision import full_precision, outside_graphs
+from rsvib_torch.execution.parallel import full_precision, outside_graphs, threads_for
 from rsvib_torch.frames.entry_points import TimedModule, module_options, vibration_options
 from rsvib_torch.frames.pixels import are_mosaics, enlarged, interpolated_colours
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames

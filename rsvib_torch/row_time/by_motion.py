@@ -13,11 +13,9 @@ from typing import Literal, ParamSpec, Protocol
 from pydantic import Field
 
 from rsvib_torch.checks.arguments import FramesOrFiles
-from rsvib_torch.checks.validation import Number, Positive
-from rsvib_torch.checks.validation import options as option_group
-from rsvib_torch.checks.values import check_number
-from rsvib_torch.execution.parallel import threads_for
-from rsvib_torch.execution.precision import full_precision, without_gradients
+from rsvib_torch.checks.values import Number, Positive, check_number
+from rsvib_torch.checks.values import options as option_group
+from rsvib_torch.execution.parallel import full_precision, threads_for, without_gradients
 from rsvib_torch.frames.entry_points import entry_point
 from rsvib_torch.frames.prepare import grey_frames, reasons_from_row_order
 from rsvib_torch.motion.timing import SensorTiming

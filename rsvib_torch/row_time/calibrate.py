@@ -6,8 +6,7 @@ from typing import Literal
 import numpy as np
 
 from rsvib_torch.checks.arguments import Channels, FramesOrFiles, checks_arguments
-from rsvib_torch.checks.validation import Positive
-from rsvib_torch.checks.values import check_number
+from rsvib_torch.checks.values import Positive, check_number
 from rsvib_torch.results.presentation import JudgedResult
 from rsvib_torch.results.reason import Reason
 from rsvib_torch.row_time.flicker import MIN_PERIODS, find_bands, row_profiles

@@ -8,6 +8,7 @@ from .process import process_stack as process_stack
 from .recorded_motion import align_stack as align_stack
 from .recorded_motion import mask_of_regions as mask_of_regions
 from .run_folder import StackReport as StackReport
+from .run_folder import work_folder as work_folder
 from .window_restoration import RestoredFrames as RestoredFrames
 from .window_restoration import restore_trusted as restore_trusted
 from .window_restoration import without_data as without_data

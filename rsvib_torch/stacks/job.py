@@ -37,11 +37,11 @@ from rsvib_torch.results.presentation import Summarised, plain_values
 from rsvib_torch.stacks.memory import windows_at_once
 from rsvib_torch.stacks.window_restoration import (
     RestoredFrames,
-    equivalent_tones,
     frame_fault,
     may_change,
     reliable_motion,
     restore_trusted,
+    tones_of_given,
     with_known_size,
     without_data,
 )
@@ -104,6 +104,7 @@ class StackJob:
     options: ProcessStackOptions
     # of every window, the motion to use instead of a detection, from its first frame on; None: it has none
     given: Sequence[DetectedVibration | FreeMotion | None] | None = None
+    is_recorded: bool = False  # whether ``given`` are parts of a recorded motion
 
     def open(self) -> FrameReader:
         """Open the stack, which must not have changed."""
@@ -145,13 +146,11 @@ class StackJob:
         timing = window_timing(self.timing, window, list(usable))
         try:
             # 2. Their motion.
-            motion = self._motion(window, taken, timing)
+            motion, tones = self._motion(window, taken, timing)
             if motion is None:
                 return replace(result, error="no detection was given for this window")
-            if isinstance(motion, DetectedVibration):
-                result = replace(result, detection=motion)
-            elif isinstance(motion, MotionDetection):
-                result = replace(result, detection=equivalent_tones(motion), motion=reliable_motion(motion)[0])
+            free = reliable_motion(motion)[0] if isinstance(motion, MotionDetection) else motion
+            result = replace(result, detection=tones, motion=free if tones and isinstance(free, FreeMotion) else None)
             if options.restoration is None:
                 return result
             # 3. The frames without it.
@@ -178,20 +177,26 @@ class StackJob:
 
     def _motion(
         self, window: Window, taken: Tensor, timing: SensorTiming
-    ) -> DetectedVibration | MotionDetection | FreeMotion | None:
-        """The motion in the frames ``taken`` of a window; None if it should be given."""
+    ) -> tuple[DetectedVibration | MotionDetection | FreeMotion | None, DetectedVibration | None]:
+        """The motion in the frames ``taken`` of a window, and its tones or those that stand for it.
+
+        The motion is None if it should be given; there are no tones of a recorded one.
+        """
+        rows = taken.shape[int(timing.scan_axis)]
         if self.given is not None:
-            return self.given[window.index]
+            given = self.given[window.index]
+            if not isinstance(given, FreeMotion) or self.is_recorded:
+                return given, given if isinstance(given, DetectedVibration) else None
+            return given, tones_of_given(given, timing, len(taken), rows)
         detected = detect_vibration(taken, timing, **self.options.detection or {})
         if self.options.detection or not may_change(detected, len(taken)):
-            return detected
+            return detected, detected
         with suppress(ValueError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
-            rows = taken.shape[int(timing.scan_axis)]
             found = detect_motion(taken, timing, knot_rows=min(24, max(4, rows // _KNOTS)))
-            found = with_known_size(found, detected)
+            found, tones = with_known_size(found, detected)
             if found.reliable.sum() > detected.reliable.sum():
-                return found
-        return detected
+                return found, tones
+        return detected, detected
 
     def _images(self, frames: Sequence[Array]) -> Tensor:
         """Frames as stored as (T, H, W) or (T, C, H, W), full scale 1."""
@@ -312,7 +317,9 @@ def plan_job(
     stated = ProcessStackOptions(**{**vars(options), **of_job})
     windows = cut_windows(info.shape[0], stated.window)
     given = _given(stated, info, timing, windows)
-    job = StackJob(Path(source), info, timing, replace(stated, given=None, motion=None), given)
+    job = StackJob(
+        Path(source), info, timing, replace(stated, given=None, motion=None), given, stated.motion is not None
+    )
     if job.chosen.mosaic is not None:
         check_mosaic(job.chosen.mosaic, info.shape, str(source))
     check_optics(job.chosen.optics)

@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
@@ -22,10 +22,10 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.results.presentation import (
     AXIS_NAMES,
     Result,
+    decode,
     joined_columns,
     plain_values,
 )
-from rsvib_torch.results.result_files import decode
 from rsvib_torch.stacks.job import StackJob
 from rsvib_torch.stacks.windows import WindowRecord
 from rsvib_torch.text import measured_text, number_of, text_table, wrapped
@@ -89,7 +89,7 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
         for record, middle in zip(self.windows, self._middle_times(), strict=True):
             first: Table = {"window": record.window, "first_frame": record.first, "last_frame": record.last}
             first |= {"start_s": record.start_time, "middle_time_s": middle}
-            last: Table = {"frames": record.frames, "outcome": record.outcome}
+            last: Table = {"equivalent": record.motion is not None, "frames": record.frames, "outcome": record.outcome}
             last["bad_frames"] = len(record.bad_frames)
             last["note"] = record.error or "; ".join(map(str, record.left_alone))
             tones = [{}] if record.detection is None else record.detection.tone_lines(pixel_size)
@@ -158,60 +158,56 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
     def lines(self) -> tuple[list[str], list[str]]:
         """The totals as lines of text: about the vibration, and about the restoration."""
         data = self.totals()
-        spread, changing = "median ± standard deviation over the windows", self._changing
-        if changing:
-            spread = f"amplitude: in the first and the last window; frequency: {spread}"
-        vibration = [text_table(*self.tone_table()), spread]
-        if changing:
-            which = "all" if changing == len(self.windows) else f"{changing} of {len(self.windows)}"
-            text = f"no steady tones explain {which} windows, whose motion was therefore measured without tones"
-            vibration.append(wrapped(f"{text}; amplitudes are those of a tone of the same rms displacement"))
-        if self.gyroscope is not None:
-            found = self.gyroscope
-            axes = ", ".join(letter.lower() if letter.isupper() else f"-{letter}" for letter in found["orientation"])
-            vibration = [
-                f"rotation by the gyroscope, whose axes {axes} are x, y, z of the camera",
-                f"time 0 of the frames is {measured_text(found['offset'], found['offset_std'])} s of the gyroscope",
-                f"focal length {measured_text(found['focal_length'], found['focal_length_std'])} px",
-            ]
-        restoration = [f"{data['restored']} of {number_of(data['windows'], 'window')} restored"]
-        if data["predicted_gain_db"] is not None:
-            gains = dict.fromkeys(f"{gain:+.1f}" for gain in data["predicted_gain_db"].values())
-            restoration.append(f"estimated improvement {' … '.join(gains)} dB")
         # All windows were measured, and nothing else than missing tones is stated against any axis.
         codes = {
             "failed" if one is None else one.codes((axis,))
             for one in self._tones
             for axis in range(2 if one is None else one.vibration.num_axes)
         }
-        still = codes == {"no_tone"}
-        if still:
-            # a hand may move the camera of a video, which is measured without tones
+        is_still = codes == {"no_tone"}
+        vibration = self._tone_lines() if self.gyroscope is None else _gyroscope_lines(self.gyroscope)
+        if is_still:
             text = ": the camera stands still, or moves uniformly or by less than the noise"
-            vibration.append(wrapped(f"no window has a significant tone{'' if 'video' in self.settings else text}"))
-        for name, notes in data["left_alone"].items():
-            if notes and not still:
-                window, note = next(iter(notes.items()))
-                where = number_of(len(notes), "window")
-                restoration.append(wrapped(f"{name} unchanged in {where}; in window {window}: {note['text']}"))
-        if "video" in self.settings and not still:
-            of_text: dict[str, list[str]] = {}  # the axes against which the same is stated
-            for axis, name in enumerate(AXIS_NAMES[:2]):
-                against = {
-                    record.window: [one for one in record.detection.findings[axis] if one.code != "no_tone"]
-                    for record in self.windows
-                    if record.detection is not None
-                }
-                refused = {number: "; ".join(map(str, why)) for number, why in against.items() if why}
-                if refused:
-                    number, why = next(iter(refused.items()))
-                    text = f"not reliable in {number_of(len(refused), 'window')}; in window {number}: {why}"
-                    of_text.setdefault(text, []).append(name)
-            for text, names in of_text.items():
-                vibration.append(wrapped(f"{' and '.join(names)} restored as measured, but {text}"))
-            assumed = [str(one) for found in self._tones if found is not None for one in found.assumptions]
-            vibration += [wrapped(f"assumed: {one}") for one in assumed[:1]]
+            # a hand may move the camera of a video, which is measured without tones
+            vibration.append(wrapped("no window has a significant tone" + text * ("video" not in self.settings)))
+        elif "video" in self.settings:
+            vibration += self._lines_of_video()
+        restoration = [f"{data['restored']} of {number_of(data['windows'], 'window')} restored"]
+        if data["predicted_gain_db"] is not None:
+            gains = dict.fromkeys(f"{gain:+.1f}" for gain in data["predicted_gain_db"].values())
+            restoration.append(f"estimated improvement {' … '.join(gains)} dB")
+        for name, notes in data["left_alone"].items() if not is_still else ():
+            texts = {window: note["text"] for window, note in notes.items()}
+            restoration += [wrapped(f"{name} unchanged in {text}") for text in _first_of(texts)]
         return vibration, restoration
+
+    def _tone_lines(self) -> list[str]:
+        """The table of tones, and what its columns mean."""
+        spread, changing = "median ± standard deviation over the windows", self._changing
+        if not changing:
+            return [text_table(*self.tone_table()), spread]
+        which = "all" if changing == len(self.windows) else f"{changing} of {len(self.windows)}"
+        text = f"no steady tones explain {which} windows, whose motion was therefore measured without tones"
+        return [
+            text_table(*self.tone_table()),
+            f"amplitude: in the first and the last window; frequency: {spread}",
+            wrapped(f"{text}; amplitudes are those of a tone of the same rms displacement"),
+        ]
+
+    def _lines_of_video(self) -> list[str]:
+        """Axes of a video that were restored although they are not reliable, and the first assumption."""
+        of_text: dict[str, list[str]] = {}  # the axes against which the same is stated
+        for axis, name in enumerate(AXIS_NAMES[:2]):
+            against = {
+                record.window: "; ".join(str(one) for one in record.detection.findings[axis] if one.code != "no_tone")
+                for record in self.windows
+                if record.detection is not None
+            }
+            for text in _first_of({window: why for window, why in against.items() if why}):
+                of_text.setdefault(text, []).append(name)
+        lines = [f"{' and '.join(names)} restored as measured, but not reliable in {t}" for t, names in of_text.items()]
+        assumed = [str(one) for found in self._tones if found is not None for one in found.assumptions]
+        return [wrapped(line) for line in (*lines, *(f"assumed: {one}" for one in assumed[:1]))]
 
     @property
     def is_removed(self) -> bool:
@@ -234,6 +230,21 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
         They are the ``given`` of ``process_stack``.
         """
         return [record.detection if record.motion is None else record.motion for record in self.windows]
+
+
+def _first_of(notes: Mapping[object, str]) -> list[str]:
+    """Number of windows with a note, and the first one; empty without notes."""
+    return [f"{number_of(len(notes), 'window')}; in window {number}: {text}" for number, text in notes.items()][:1]
+
+
+def _gyroscope_lines(found: Table) -> list[str]:
+    """Axes, clock and focal length by the gyroscope of a video."""
+    axes = ", ".join(letter.lower() if letter.isupper() else f"-{letter}" for letter in found["orientation"])
+    return [
+        f"rotation by the gyroscope, whose axes {axes} are x, y, z of the camera",
+        f"time 0 of the frames is {measured_text(found['offset'], found['offset_std'])} s of the gyroscope",
+        f"focal length {measured_text(found['focal_length'], found['focal_length_std'])} px",
+    ]
 
 
 _SAME_TONE = 0.03  # of the frequency, or 4 std: a tone of the next window closer than this is the same one

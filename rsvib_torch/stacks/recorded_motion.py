@@ -15,11 +15,12 @@ from torch import Tensor
 from rsvib_torch.gyroscope.alignment import ClockAlignment, FittedClock, align_motion
 from rsvib_torch.gyroscope.corner_tracks import corner_tracks
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
-from rsvib_torch.gyroscope.rotation_alignment import AlignOptions, RotationAlignment, align_rates, offset_range, outside
+from rsvib_torch.gyroscope.rotation_alignment import AlignOptions, RotationAlignment, align_rates, offset_range
 from rsvib_torch.io.frame_times import timing_from_first_frame
 from rsvib_torch.io.full_scale import counts_to_frames
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.io.stack_reading import open_stack
+from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.job import stored_frame
@@ -73,7 +74,9 @@ def align_stack(
     info: StackInfo,
     timing: SensorTiming,
     recorded: FreeMotion | AngularRates,
-    options: AlignOptions,
+    *,
+    camera: Camera | None = None,
+    ignore: Tensor | None = None,
 ) -> ClockAlignment | RotationAlignment:
     """``align_motion`` for a stack of any length, in bounded time and memory.
 
@@ -81,18 +84,17 @@ def align_stack(
     frames; of stacks that are not longer, all frames are used. ``info`` describes the stack, with its full scale;
     ``timing`` is that of the caller. The mask ``ignore`` (H, W) is that of all frames.
     """
-    timing, offsets = timing_from_first_frame(timing, info), options.offsets
+    timing = timing_from_first_frame(timing, info)
     if isinstance(recorded, AngularRates):
         pairs = compared_pairs(info.shape[0])
         starts = timing.frame_starts(info.shape[0]).tolist()
-        ignore = None if options.ignore is None else torch.as_tensor(options.ignore)
         tracks = corner_tracks(_grey_frames(source, info, pairs, ignore), starts, timing)
-        return align_rates(tracks, timing, recorded, options)
+        return align_rates(tracks, timing, recorded, AlignOptions(camera=camera, ignore=ignore))
     runs = compared_runs(info.shape[0])
-    align = partial(align_motion, ignore=options.ignore)
+    align = partial(align_motion, ignore=ignore)
     if len(runs) == 1:
-        return align(*part_of_stack(source, info, timing, runs[0]), recorded, offsets=offsets)
-    return _aligned_runs(source, info, timing, recorded, runs, offsets, align)
+        return align(*part_of_stack(source, info, timing, runs[0]), recorded)
+    return _aligned_runs(source, info, timing, recorded, runs, align)
 
 
 def _grey_frames(
@@ -116,14 +118,13 @@ def _aligned_runs(
     timing: SensorTiming,
     recorded: FreeMotion,
     runs: list[slice],
-    offsets: tuple[float, float] | None,
     align: Callable[..., ClockAlignment],
 ) -> ClockAlignment:
     """The clock by the runs of a long stack, each of which determines its reading at one time."""
     # 1. The run in the middle, at all offsets; then the others, near its clock.
     starts = timing.frame_starts(info.shape[0])
     readout = info.shape[int(timing.scan_axis)] * timing.row_time + timing.exposure_time
-    limits = offset_range(recorded.start, recorded.end, 0.0, float(starts[-1] - starts[0]) + readout, offsets)
+    limits = offset_range(recorded.start, recorded.end, 0.0, float(starts[-1] - starts[0]) + readout, None)
     found: list[ClockAlignment] = []
     middles: list[float] = []
     for run in sorted(runs, key=lambda run: abs(run.start - runs[len(runs) // 2].start)):
@@ -146,7 +147,6 @@ def _aligned_runs(
     offset, offset_std = float(gradient @ line), math.sqrt(gradient @ covariance @ gradient)
     # 3. The motion with the drift in the middle of the stack.
     clock = FittedClock(offset + scale * middle, scale, tuple(found[0].drift.tolist()), middle)
-    findings = tuple(outside(offset, offset_std, offsets))
     return replace(
         found[0],
         motion=clock.motion(recorded),
@@ -154,6 +154,4 @@ def _aligned_runs(
         offset_std=offset_std,
         scale=scale,
         scale_std=math.sqrt(covariance[0, 0]),
-        reliable=not findings,
-        findings=findings,
     )

@@ -35,8 +35,7 @@ from rsvib_torch.files.reading import Table
 from rsvib_torch.io.stack_writing import stack_files
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import RunOptions
-from rsvib_torch.results.presentation import Summarised, plain_values
-from rsvib_torch.results.result_files import decode
+from rsvib_torch.results.presentation import Summarised, decode, plain_values
 from rsvib_torch.stacks.job import WindowResult
 from rsvib_torch.stacks.manifest import StackManifest, read_manifest
 from rsvib_torch.stacks.windows import WindowRecord

@@ -14,6 +14,7 @@ from torch import Tensor
 from rsvib_torch.checks.values import MAX_NUMBER, beyond_full_scale
 from rsvib_torch.detection import MotionDetection
 from rsvib_torch.detection.verdict import MAX_DISPLACEMENT_STD
+from rsvib_torch.files.reading import Table
 from rsvib_torch.frames.prepare import constant_frame, prepare_frames
 from rsvib_torch.imaging.sensor_model import sharpened
 from rsvib_torch.motion.detected_vibration import DetectedVibration
@@ -136,8 +137,8 @@ def may_change(detection: DetectedVibration, num_frames: int) -> bool:
 _NEARLY_BLIND = 0.5  # offset gain; of the sweeps and decays below, 0.06 to 0.18, of others 1.6 and more
 
 
-def with_known_size(found: MotionDetection, detected: DetectedVibration) -> MotionDetection:
-    """A motion whose axes are refused if most of it is common to all frames, so that its size is not known.
+def with_known_size(found: MotionDetection, detected: DetectedVibration) -> tuple[MotionDetection, DetectedVibration]:
+    """A motion and its equivalent tones, without axes whose size is not known: most of it is common to all frames.
 
     That is so if the steady tone that was ``detected`` has a small gain, and the standard deviation is more than a
     quarter of the displacement. Vibrations that sweep or decay near the frame rate were wrong by 7 standard deviations,
@@ -151,22 +152,41 @@ def with_known_size(found: MotionDetection, detected: DetectedVibration) -> Moti
         if bool(reliable[axis]) and is_blind and std > allowed:
             reliable[axis] = False
             findings[axis] = (Reason("displacement_uncertain", AXIS_NAMES[axis], std, allowed, {"size": size}),)
-    return replace(found, reliable=reliable, findings=tuple(findings))
+    verdict: Table = {"reliable": reliable, "findings": tuple(findings)}
+    return replace(found, **verdict), replace(tones, **verdict)
 
 
 _SAMPLES = 4096  # of a motion in its record, for the spectrum: 500 per frame of a window of 8
 
 
 def equivalent_tones(found: MotionDetection) -> DetectedVibration:
+    """``tones_in_place_of`` a detected motion."""
+    first, last = float(found.times.min()), float(found.times.max())
+    std, interval = found.std.square().mean((0, 1)).sqrt(), float(found.times[:, 0].diff().mean())
+    tones = tones_in_place_of(found.motion, first, last, std, interval)
+    return replace(tones, residual=found.unexplained, reliable=found.reliable, findings=found.findings)
+
+
+def tones_of_given(motion: FreeMotion, timing: SensorTiming, num_frames: int, rows: int) -> DetectedVibration:
+    """``tones_in_place_of`` a motion of a window that was measured before, whose standard deviations are unknown."""
+    starts = timing.frame_starts(num_frames)
+    last = float(starts[-1]) + (rows - 1) * timing.row_time + timing.exposure_time
+    unknown = torch.full((motion.num_axes,), math.inf, dtype=torch.float64, device=motion.coefficients.device)
+    return tones_in_place_of(motion, float(starts[0]), last, unknown, float(starts.diff().mean()))
+
+
+def tones_in_place_of(
+    motion: FreeMotion, first: float, last: float, displacement: Tensor, interval: float
+) -> DetectedVibration:
     """A tone for each axis of a motion of any shape, to draw it and list it beside the tones of other windows.
 
     The amplitude is that of a tone with the same rms displacement from a straight line. The frequency is that of the
-    largest part of the motion, with half of the resolution of its record as standard deviation.
+    largest part of the motion, with half of the resolution of its record as standard deviation. The record is that
+    from ``first`` to ``last`` (s) with frames every ``interval``; ``displacement`` (A,) is the standard deviation.
     """
     # 1. The motion, less a straight line.
-    first, last = float(found.times.min()), float(found.times.max())
-    times = torch.linspace(first, last, _SAMPLES, dtype=torch.float64, device=found.times.device)
-    moved = found.motion.displacement(times)
+    times = torch.linspace(first, last, _SAMPLES, dtype=torch.float64, device=displacement.device)
+    moved = motion.displacement(times)
     centred = (times - times.mean())[:, None]
     speed = (moved * centred).sum(0) / centred.square().sum()
     moved = moved - moved.mean(0) - speed * centred
@@ -181,7 +201,6 @@ def equivalent_tones(found: MotionDetection) -> DetectedVibration:
         amplitude, frequency, phase + 0.5 * math.pi - 2 * math.pi * frequency * first, image_motion=speed
     )
     # 3. Standard deviations.
-    displacement = found.std.square().mean((0, 1)).sqrt()
     unknown = torch.full_like(amplitude, math.inf)
     by_frequency = torch.full_like(amplitude, 0.5 / (last - first))
     std = VibrationStd(
@@ -193,10 +212,9 @@ def equivalent_tones(found: MotionDetection) -> DetectedVibration:
         image_acceleration=unknown[:, 0],
         displacement=displacement,
     )
-    interval = float(found.times[:, 0].diff().mean())
-    return DetectedVibration(
-        vibration, std, vibration.gain(interval), found.unexplained, found.reliable, found.findings, assumptions=()
-    )
+    moves = motion.moving_axes()
+    none, findings = torch.zeros_like(displacement), tuple(() for _ in moves)
+    return DetectedVibration(vibration, std, vibration.gain(interval), none, moves, findings, assumptions=())
 
 
 def reliable_motion(found: MotionDetection) -> tuple[FreeMotion, tuple[Reason, ...]]:

@@ -43,8 +43,7 @@ from rsvib_torch.detection.tones.fit import (
 from rsvib_torch.detection.tones.selection import MIN_SIGNIFICANCE
 from rsvib_torch.detection.tones.uncertainty import with_unknown_amplitudes
 from rsvib_torch.detection.verdict import contradicted_axes, judged, scene_reasons, with_remedy
-from rsvib_torch.execution.parallel import threads_for
-from rsvib_torch.execution.precision import full_precision, outside_graphs, without_gradients
+from rsvib_torch.execution.parallel import full_precision, outside_graphs, threads_for, without_gradients
 from rsvib_torch.frames.entry_points import module_options
 from rsvib_torch.frames.pixels import detailed_parts
 from rsvib_torch.frames.prepare import (

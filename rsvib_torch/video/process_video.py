@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from rsvib_torch.checks.arguments import PathLike
-from rsvib_torch.checks.validation import fields_of
+from rsvib_torch.checks.values import fields_of
 from rsvib_torch.execution.parallel import in_threads
 from rsvib_torch.files.atomic import whole_file
 from rsvib_torch.files.reading import Table

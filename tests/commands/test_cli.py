@@ -10,7 +10,7 @@ import torch
 from program import refused, rsvib
 from truth import MARGIN, Curve, Motion, crop, decibel, draw_scene, take_frames
 
-from rsvib_torch import SensorNoise, SensorTiming, StackInfo, Vibration, __version__, simulate_frames
+from rsvib_torch import SensorNoise, SensorTiming, StackInfo, Vibration, __version__, read_manifest, simulate_frames
 from rsvib_torch.io import read_stack, read_stack_info, write_stack
 
 AMPLITUDE, FREQUENCY, PHASE = (1.6, 1.1), (71.0, 113.0), (0.6, -1.2)
@@ -132,14 +132,15 @@ def test_options_of_restoration_come_from_config_or_command_line(place, tmp_path
     config.write_text(CONFIG + "[restoration]\nmethod = 'banded'\nhalf_rows = 8\nsaturation = 4000\n")
     common = ("run", place / "frames.tif", out, "--config", config, "--overwrite")
     assert rsvib(*common) == 0
-    report = json.loads((out / "restoration.json").read_text())
-    assert report["options"] == {"method": "banded", "half_rows": 8, "saturation": 4000 / 4095}
-    assert (report["outcome"], report["frames"], report["left_alone"]) == ("helps", "restored", [])
+    manifest = read_manifest(out / "manifest.json")
+    assert manifest.settings["restoration"] == {"method": "banded", "half_rows": 8, "saturation": 4000 / 4095}
+    (record,) = manifest.windows
+    assert (record.outcome, record.frames, record.left_alone) == ("helps", "restored", ())
     assert "restored frames agree; estimated improvement +" in capsys.readouterr().out
     # options of the configured method are dropped with it
     assert rsvib(*common, "--method", "exact", "--joint", "all", "--saturation", 4095) == 0
-    report = json.loads((out / "restoration.json").read_text())
-    assert report["options"] == {"method": "exact", "joint": True, "saturation": 1.0}
+    stated = read_manifest(out / "manifest.json").settings["restoration"]
+    assert stated == {"method": "exact", "joint": True, "saturation": 1.0}
     assert read_stack_info(out / "restored.tif").shape == (1, 304, 176)
     at_rest = read_stack(place / "scene.png")[0, 32:-32, 32:-32]
     assert decibel(read_stack(out / "restored.tif")[0], at_rest.numpy()) > 40
@@ -162,7 +163,7 @@ def test_full_scale_comes_from_option_file_or_config(place, tmp_path, capsys):
     for command in (("detect", "--out", tmp_path / "out2"), ("restore", tmp_path / "r.tif", *found)):
         unknown = refused(capsys, command[0], arguments[0], *command[1:], "--config", silent)
         assert "plain.tif: the full scale of its uint16 counts is not known: give --full-scale, e.g. 4095" in unknown
-    assert "beyond full_scale=100" in refused(capsys, "detect", *arguments, "--full-scale", 100)
+    assert "beyond --full-scale=100" in refused(capsys, "detect", *arguments, "--full-scale", 100)
     assert not (tmp_path / "out2").exists()
 
 

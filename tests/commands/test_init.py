@@ -96,9 +96,9 @@ def test_missing_values_are_explained_in_one_line_each(place, frames, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--row-time", "40"), "row_time=40 s is longer than 10 ms; row_time is in seconds (40 us is 40e-6)"),
-        (("--row-time", "600us"), "with 29.97 frames/s, row_time is at most 0.000521354 s"),
-        (("--frame-rate", "0.033"), "frame_rate=0.033 is less than 0.1; it is in frames per second"),
+        (("--row-time", "40"), "--row-time=40 s is longer than 10 ms; --row-time is in seconds (40 us is 40e-6)"),
+        (("--row-time", "600us"), "with 29.97 frames/s, --row-time is at most 0.000521354 s"),
+        (("--frame-rate", "0.033"), "--frame-rate=0.033 is less than 0.1; it is in frames per second"),
         (("--out", "none/camera.toml"), "folder"),
     ],
 )

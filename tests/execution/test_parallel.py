@@ -5,8 +5,7 @@ import pytest
 import threadpoolctl
 import torch
 
-from rsvib_torch.execution.parallel import in_parallel, threads_for
-from rsvib_torch.execution.precision import without_gradients
+from rsvib_torch.execution.parallel import in_parallel, threads_for, without_gradients
 
 CPU = torch.device("cpu")
 

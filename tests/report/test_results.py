@@ -19,11 +19,8 @@ from rsvib_torch.report.results import (
     check_same_timing,
     read_vibration,
     write_offsets,
-    write_restoration,
 )
-from rsvib_torch.restoration import RestorationVerdict
-from rsvib_torch.results.reason import Reason
-from rsvib_torch.stacks import RestoredFrames, read_manifest
+from rsvib_torch.stacks import read_manifest
 
 TIMING = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
 
@@ -106,29 +103,6 @@ def test_malformed_vibration_files_are_refused(tmp_path, result, change, message
         read_vibration(path, TIMING)
     assert str(caught.value).startswith(f"{path}: {message}")
     assert "\n" not in str(caught.value)
-
-
-def test_restoration_json(tmp_path):
-    pair = torch.tensor([[0.1, math.nan]], dtype=torch.float64)
-    one = torch.tensor([math.nan], dtype=torch.float64)
-    remains = Reason("motion_remains", "x", 3.0, 1.6, {"before": 2.0})
-    verdict = RestorationVerdict(one, one, pair, pair, pair, one, one, one, ("worse",), ((remains,),))
-    options = {"method": "exact", "joint": True}
-    left_alone = Reason("axis_not_reliable", "y", details={"action": "restored", "why": "blind"})
-    path = tmp_path / "restoration.json"
-    frames = torch.rand(2, 8, 8)
-    write_restoration(path, RestoredFrames(frames, False, (left_alone,), verdict, True), options)
-    data = json.loads(path.read_text())
-    assert data["frames"] == "as taken"
-    assert data["options"] == options
-    assert data["left_alone"] == [left_alone.to_dict()]
-    assert data["outcome"] == "worse"
-    assert data["summary"] == f"restored is no better than raw: x: {remains}"
-    assert data["pairs"]["misfit_before"] == [[0.1, None]]
-    (found,) = data["pairs"]["findings"][0]
-    assert (found["code"], found["axis"], found["value"], found["limit"]) == ("motion_remains", "x", 3.0, 1.6)
-    write_restoration(path, RestoredFrames(frames, True, (), None, True), {})
-    assert json.loads(path.read_text())["outcome"] is None
 
 
 def test_offsets_are_written_one_line_per_band(tmp_path, result):

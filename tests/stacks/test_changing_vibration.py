@@ -59,6 +59,7 @@ def test_windows_state_equivalent_tones_and_their_motion(place):
     manifest = read_manifest(place / "out.npy.manifest.json")
     table = manifest.table()
     assert all(table["reliable"])
+    assert all(table["equivalent"])
     envelope = np.exp(-np.array(table["middle_time_s"]) / DECAY)
     windows = len(manifest.windows)
     np.testing.assert_allclose(table["amplitude_px"], np.tile(AMPLITUDE, windows) * envelope, rtol=0.1)
@@ -76,6 +77,15 @@ def test_the_motions_of_a_manifest_restore_the_same_frames(place, tmp_path):
     given = read_manifest(place / "out.npy.manifest.json").detections()
     process(place, tmp_path / "out.npy", given=given)
     np.testing.assert_array_equal(np.load(tmp_path / "out.npy"), np.load(place / "out.npy"))
+    first, again = (read_manifest(f"{path}/out.npy.manifest.json").totals()["tones"] for path in (place, tmp_path))
+    for name in "xy":
+        assert again[name]["reliable_windows"] == first[name]["reliable_windows"]
+        assert again[name]["tones"][0]["amplitude"] == pytest.approx(first[name]["tones"][0]["amplitude"], rel=0.05)
+
+
+def test_detect_names_the_command_that_measures_a_vibration_that_changes(place, tmp_path, capsys):
+    assert rsvib("detect", place / "frames.npy[0:8]", *CAMERA, "--out", tmp_path / "out") == 0
+    assert "measure a vibration that changes, and restore the frames:\n    rsvib run" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("joint", [True, 3])

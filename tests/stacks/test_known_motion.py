@@ -9,7 +9,6 @@ from program import rsvib
 from truth import MARGIN, Curve, draw_scene, take_frames
 
 import rsvib_torch as rsv
-from rsvib_torch.gyroscope import AlignOptions
 from rsvib_torch.stacks import align_stack
 
 HEIGHT, WIDTH, COUNT = 160, 128, 60
@@ -46,13 +45,11 @@ def make_place(tmp_path_factory):
 def test_the_clock_over_a_long_stack_is_found_by_parts_of_it(place):
     recorded = rsv.read_motion(place / "motion.csv", unit="px")
     info = rsv.read_stack_info(place / "frames.npy")
-    found = align_stack(place / "frames.npy", info, TIMING, recorded, AlignOptions())
+    found = align_stack(place / "frames.npy", info, TIMING, recorded)
     assert found.reliable, found.reasons
     assert found.offset == pytest.approx(CLOCK, abs=3e-5)
     assert abs(found.offset - CLOCK) < 4 * found.offset_std
     assert abs(found.scale - SPEED) < min(4 * found.scale_std, 1e-4)
-    off = align_stack(place / "frames.npy", info, TIMING, recorded, AlignOptions(offsets=(812.3, 812.34)))
-    assert not off.reliable
 
 
 def test_parts_that_are_fixed_to_the_camera_do_not_count(place, tmp_path):
@@ -61,7 +58,7 @@ def test_parts_that_are_fixed_to_the_camera_do_not_count(place, tmp_path):
     np.save(tmp_path / "frames.npy", frames.astype(np.float32))
     recorded, info = rsv.read_motion(place / "motion.csv", unit="px"), rsv.read_stack_info(tmp_path / "frames.npy")
     ignore = torch.arange(HEIGHT)[:, None].expand(HEIGHT, WIDTH) >= 100
-    found = align_stack(tmp_path / "frames.npy", info, TIMING, recorded, AlignOptions(ignore=ignore))
+    found = align_stack(tmp_path / "frames.npy", info, TIMING, recorded, ignore=ignore)
     assert found.reliable, found.reasons
     assert found.offset == pytest.approx(CLOCK, abs=1e-4)
 

@@ -33,8 +33,7 @@ from rsvib_torch.detection.tones.fit import ToneFit, fit_tones, fitted_again, mo
 from rsvib_torch.detection.tones.selection import find_tones, with_best_aliases
 from rsvib_torch.detection.tones.uncertainty import with_further_tones
 from rsvib_torch.detection.verdict import rotation_reasons, scene_reasons
-from rsvib_torch.execution.parallel import threads_for
-from rsvib_torch.execution.precision import full_precision, without_gradients
+from rsvib_torch.execution.parallel import full_precision, threads_for, without_gradients
 from rsvib_torch.frames.entry_points import frames_options
 from rsvib_torch.frames.prepare import (
     GreyFrames,

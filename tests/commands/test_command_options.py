@@ -1,0 +1,99 @@
+"""Values of options, and errors about them."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+from program import refused, rsvib
+from small_stack import CAMERA, write_small
+
+
+@pytest.fixture(scope="module", name="place")
+def make_place(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("options")
+    write_small(folder / "frames.tif", 3)
+    (folder / "camera.toml").write_text(CAMERA)
+    return folder
+
+
+def command(place, name, *more):
+    return (name, place / "frames.tif", *more, "--config", place / "camera.toml")
+
+
+@pytest.mark.parametrize(("level", "stated"), [("auto", 1.0), ("none", None), ("4000", 4000 / 4095)])
+def test_saturation_is_a_level_or_a_word(place, tmp_path, level, stated):
+    assert rsvib(*command(place, "run", tmp_path / "out"), "--saturation", level) == 0
+    options = json.loads((tmp_path / "out" / "manifest.json").read_text())["settings"]["restoration"]
+    assert options["saturation"] == stated
+
+
+def test_mistakes_are_those_of_the_file_or_of_the_command_line(place, tmp_path, capsys):
+    detect = ("--out", tmp_path / "out")
+    error = refused(capsys, *command(place, "detect", *detect), "--row-time", "5")
+    assert error.startswith("rsvib: error: the command line: sensor: --row-time=5 s is longer than 10 ms")
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text(CAMERA.replace("frame_rows = 104", "frame_rows = 3"))
+    error = refused(capsys, "detect", place / "frames.tif", "--config", wrong, *detect, "--scan-axis", "y")
+    assert error.startswith(f"rsvib: error: {wrong}: sensor: exposure_rows=6 exceeds")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("calibrate", "--frequency", -5), "--frequency must be larger than 0"),
+        (("calibrate", "--by-motion", "--frame-rate", 90, "--row-time", "10us"), "give --row-time twice"),
+        (("calibrate", "--by-motion", "--frame-rate", 90, "--exposure", 20), "--exposure=20 s exceeds the frame"),
+        (("detect", "--config", "{}", "--out", "d", "--full-scale", 0), "--full-scale must be larger than 0"),
+        (("motion", "--config", "{}", "--out", "m.csv", "--knot-rows", 1), "--knot-rows must be at least 4"),
+        (
+            ("run", "r", "--config", "{}", "--method", "exact", "--joint", 4),
+            "--joint 4 exceeds the number of",
+        ),
+    ],
+)
+def test_errors_name_options_instead_of_arguments_of_python(place, tmp_path, monkeypatch, capsys, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    name, *more = (str(one).format(place / "camera.toml") for one in arguments)
+    scale = () if "--full-scale" in more else ("--full-scale", 4095)
+    assert message in refused(capsys, name, place / "frames.tif", *more, *scale)
+
+
+def test_a_missing_input_is_reported_before_an_existing_output(tmp_path, capsys):
+    (tmp_path / "camera.toml").write_text("")
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "tones.csv").write_text("")
+    camera = ("--row-time", "100us", "--exposure", "1ms", "--frame-rate", 90)
+    for arguments in (("init", "--out", tmp_path / "camera.toml"), ("run", tmp_path / "results")):
+        error = refused(capsys, arguments[0], tmp_path / "none.tif", *arguments[1:], *camera)
+        assert error == f"rsvib: error: {tmp_path / 'none.tif'} does not exist\n"
+
+
+def test_a_complete_run_is_not_computed_again(place, tmp_path, capsys, monkeypatch):
+    arguments = command(place, "run", tmp_path / "out")
+    assert rsvib(*arguments) == 0
+    files = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").iterdir()}
+    monkeypatch.setattr("rsvib_torch.stacks.iterate_stack", None)
+    capsys.readouterr()
+    assert rsvib(*arguments, "--resume", "--json") == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["windows"]["restored"] == 1
+    assert sorted(answer["files"]) == sorted(map(str, files))
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "out").iterdir()} == files
+
+
+def test_a_session_that_is_stopped_before_it_begins_is_one_line(place, tmp_path, capsys, monkeypatch):
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("rsvib_torch.stacks.process.read_windows", stop)
+        assert rsvib(*command(place, "run", tmp_path / "out")) == 130
+    assert capsys.readouterr().err == "rsvib: error: stopped\n"
+    program = "import sys; sys.modules['rsvib_torch.commands.main'] = None\n"
+    program += "import builtins, rsvib_torch.__main__ as entry\n"
+    program += "def stop(name, *a): raise KeyboardInterrupt\n"
+    program += "builtins.__import__ = stop\nentry.main()"
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=os.environ, check=False)
+    assert (ended.returncode, ended.stderr) == (130, "rsvib: error: stopped\n")
