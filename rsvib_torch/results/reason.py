@@ -337,9 +337,10 @@ _SHAPES = {
     ),
     "common_motion_uncertain": _px(
         "the part of the motion that all frames have in common has a standard deviation of {value:.3g} px, more than "
-        "the motion of {limit:.3g} px",
+        "{limit:.3g} px",
         "use more frames, or frames at other or unequal intervals; tones are measured by detect_vibration",
-        compares="rms standard deviation of the common part of the motion, above 0.3 px and the rms motion",
+        compares="rms standard deviation of the common part of the motion, above 0.3 px and the rms motion, or above "
+        "0.2 of the motion if its largest part is near a multiple of the frame rate",
     ),
     "common_motion_large": _px(
         "all frames have {value:.3g} px of the motion in common, more than {limit:.3g} px, ten times what differs "

@@ -37,12 +37,12 @@ from rsvib_torch.results.presentation import Summarised, plain_values
 from rsvib_torch.stacks.memory import windows_at_once
 from rsvib_torch.stacks.window_restoration import (
     RestoredFrames,
+    equivalent_tones,
     frame_fault,
     may_change,
     reliable_motion,
     restore_trusted,
     tones_of_given,
-    with_known_size,
     without_data,
 )
 from rsvib_torch.stacks.windows import Window, WindowRecord, cut_windows, window_timing
@@ -193,9 +193,8 @@ class StackJob:
             return detected, detected
         with suppress(ValueError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
             found = detect_motion(taken, timing, knot_rows=min(24, max(4, rows // _KNOTS)))
-            found, tones = with_known_size(found, detected)
             if found.reliable.sum() > detected.reliable.sum():
-                return found, tones
+                return found, equivalent_tones(found)
         return detected, detected
 
     def _images(self, frames: Sequence[Array]) -> Tensor:

@@ -13,15 +13,14 @@ from torch import Tensor
 
 from rsvib_torch.checks.values import MAX_NUMBER, beyond_full_scale
 from rsvib_torch.detection import MotionDetection
-from rsvib_torch.detection.verdict import MAX_DISPLACEMENT_STD
-from rsvib_torch.files.reading import Table
+from rsvib_torch.detection.shapes.free import vibration_in_place_of
 from rsvib_torch.frames.prepare import constant_frame, prepare_frames
 from rsvib_torch.imaging.sensor_model import sharpened
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.motion.vibration import Vibration, VibrationStd
+from rsvib_torch.motion.vibration import VibrationStd
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import RestorationOptions
 from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError
@@ -134,31 +133,6 @@ def may_change(detection: DetectedVibration, num_frames: int) -> bool:
     return num_frames >= _LEAST_FRAMES and not is_other_timing and not _CHANGES.isdisjoint(codes)
 
 
-_NEARLY_BLIND = 0.5  # offset gain; of the sweeps and decays below, 0.06 to 0.18, of others 1.6 and more
-
-
-def with_known_size(found: MotionDetection, detected: DetectedVibration) -> tuple[MotionDetection, DetectedVibration]:
-    """A motion and its equivalent tones, without axes whose size is not known: most of it is common to all frames.
-
-    That is so if the steady tone that was ``detected`` has a small gain, and the standard deviation is more than a
-    quarter of the displacement. Vibrations that sweep or decay near the frame rate were wrong by 7 standard deviations,
-    1.7 px, with standard deviations of 0.4 to 0.5 of the displacement.
-    """
-    tones, findings, reliable = equivalent_tones(found), list(found.findings), found.reliable.clone()
-    for axis in range(len(findings)):
-        size, std = (float(of.amplitude[axis, 0]) / math.sqrt(2) for of in (tones.vibration, tones.std))
-        allowed, gain = MAX_DISPLACEMENT_STD * size, float(detected.gain[axis, 0].abs())
-        is_blind = gain < _NEARLY_BLIND and float(detected.vibration.amplitude[axis, 0]) > 0
-        if bool(reliable[axis]) and is_blind and std > allowed:
-            reliable[axis] = False
-            findings[axis] = (Reason("displacement_uncertain", AXIS_NAMES[axis], std, allowed, {"size": size}),)
-    verdict: Table = {"reliable": reliable, "findings": tuple(findings)}
-    return replace(found, **verdict), replace(tones, **verdict)
-
-
-_SAMPLES = 4096  # of a motion in its record, for the spectrum: 500 per frame of a window of 8
-
-
 def equivalent_tones(found: MotionDetection) -> DetectedVibration:
     """``tones_in_place_of`` a detected motion."""
     first, last = float(found.times.min()), float(found.times.max())
@@ -180,27 +154,11 @@ def tones_in_place_of(
 ) -> DetectedVibration:
     """A tone for each axis of a motion of any shape, to draw it and list it beside the tones of other windows.
 
-    The amplitude is that of a tone with the same rms displacement from a straight line. The frequency is that of the
-    largest part of the motion, with half of the resolution of its record as standard deviation. The record is that
-    from ``first`` to ``last`` (s) with frames every ``interval``; ``displacement`` (A,) is the standard deviation.
+    The standard deviation of the frequency is half of the resolution of the record, which is that from ``first`` to
+    ``last`` (s) with frames every ``interval``; ``displacement`` (A,) is the standard deviation of the motion.
     """
-    # 1. The motion, less a straight line.
-    times = torch.linspace(first, last, _SAMPLES, dtype=torch.float64, device=displacement.device)
-    moved = motion.displacement(times)
-    centred = (times - times.mean())[:, None]
-    speed = (moved * centred).sum(0) / centred.square().sum()
-    moved = moved - moved.mean(0) - speed * centred
-    # 2. Its size, and the largest part of its spectrum.
-    window = torch.hann_window(_SAMPLES, dtype=torch.float64, device=times.device)[:, None]
-    spectrum = torch.fft.rfft(window * moved, n=4 * _SAMPLES, dim=0)
-    cycles = torch.fft.rfftfreq(4 * _SAMPLES, (last - first) / (_SAMPLES - 1), dtype=torch.float64, device=times.device)
-    largest = 1 + spectrum[1:].abs().argmax(0, keepdim=True)
-    frequency = cycles[largest].mT  # (A, 1)
-    amplitude, phase = math.sqrt(2) * moved.square().mean(0)[:, None].sqrt(), spectrum.gather(0, largest).angle().mT
-    vibration = Vibration(
-        amplitude, frequency, phase + 0.5 * math.pi - 2 * math.pi * frequency * first, image_motion=speed
-    )
-    # 3. Standard deviations.
+    vibration = vibration_in_place_of(motion, first, last)
+    amplitude, frequency = vibration.amplitude, vibration.frequency
     unknown = torch.full_like(amplitude, math.inf)
     by_frequency = torch.full_like(amplitude, 0.5 / (last - first))
     std = VibrationStd(
