@@ -46,6 +46,9 @@ _LAYER_LIMITS = np.array([0.7, 1.4, 2.8, 5.6])
 # the background moved by 5 to 8 px in the restored frames. A subject that follows the camera may rest on half of it
 _AT_REST, _OF_SIDE = 0.3, 0.8
 _SIDES = np.s_[:, 0], np.s_[:, -1], np.s_[0], np.s_[-1]
+# Of a frame that repeats itself at a distance, the correlation with itself: 1.00 of a fence, at most 0.41 of 13 scenes,
+# of bricks as well; and at half of the distance. Beyond this distance from no shift (px), in the middle of this side
+_REPEATS, _BETWEEN, _NEAR, _MIDDLE = 0.8, 0.5, 3, 512
 _NO_CORNERS = np.zeros((0, 2)), np.zeros(0, np.int64)
 
 
@@ -196,6 +199,34 @@ def eight_bits(frame: Array, levels: Array) -> Grey:
 def reduction(height: int, width: int) -> int:
     """By how much the sides of frames are reduced before corners are followed."""
     return int(2 ** max(0, math.ceil(0.5 * math.log2(height * width / _MOST_PIXELS))))
+
+
+def repetition(grey: Grey) -> Array | None:
+    """(2,) px (x, y), the shortest shift after which a frame (H, W) shows the same again, such as a fence; else None.
+
+    Corners cannot show by how many such shifts the frame has moved.
+    """
+    # 1. The correlation of detail with itself, at shifts of up to half of the middle of the frame.
+    scale = reduction(*grey.shape)
+    small = cv2.resize(grey, None, fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA).astype(np.float32)
+    top, left = (max(0, length - _MIDDLE) // 2 for length in small.shape)
+    small = small[top : top + _MIDDLE, left : left + _MIDDLE]
+    detail = small - cv2.blur(small, (_AROUND, _AROUND))
+    size = [2 * length for length in detail.shape]
+    power = np.fft.irfft2(np.abs(np.fft.rfft2(detail, size)) ** 2, size)
+    overlap = np.outer(*(length - np.abs(np.fft.fftfreq(2 * length, 0.5 / length)) for length in detail.shape))
+    if power[0, 0] < overlap[0, 0]:  # less than one count
+        return None
+    correlation = np.fft.fftshift(power / np.maximum(overlap, 1.0))
+    height, width = (length // 2 for length in detail.shape)
+    correlation = correlation[height : 3 * height + 1, width : 3 * width + 1] * (overlap[0, 0] / power[0, 0])
+    correlation = correlation.astype(np.float32)
+    # 2. The nearest of its other maxima that is about as high as without a shift.
+    y, x = np.nonzero((correlation > _REPEATS) & (correlation >= cv2.dilate(correlation, np.ones((3, 3)))))
+    between = correlation[(y + height) // 2, (x + width) // 2]  # along a straight edge, it remains as high
+    shifts = np.stack([x - width, y - height], -1)[between < _BETWEEN]
+    shifts = shifts[np.hypot(*shifts.T) > _NEAR]
+    return scale * shifts[np.hypot(*shifts.T).argmin()].astype(np.float64) if len(shifts) else None
 
 
 def _grid(height: int, width: int) -> tuple[int, int]:

@@ -373,3 +373,13 @@ def test_frames_that_the_camera_has_stabilised_are_moved_as_a_whole(tmp_path, ca
     assert after < 0.1 * before
     rows = json.loads(shown.out)["shaking"]["rows"]
     assert rows[1] < 1.2 * rows[0] + 0.02  # px; nothing was skewed
+
+
+def test_a_scene_that_repeats_itself_is_refused_where_it_moves_by_much_of_its_period(tmp_path):
+    height, width = (side + 2 * MARGIN for side in (HEIGHT, WIDTH))
+    period = draw_scene(height, 20, 3, 1.0)
+    fence = np.stack([np.tile(period, width // 20 + 1)[:, :width]] * 3)
+    clip = write(tmp_path / "fence.mp4", counts_of(shaken(amplitude=25.0, frequency=4.3), scene=fence))
+    target = tmp_path / "steady.mp4"
+    refuses(lambda: process_video(clip, target, TIMING, steady=1.0, **OPTIONS), "every 20 px")
+    assert not target.exists()
