@@ -76,7 +76,7 @@ def test_a_fisheye_lens(place, tmp_path, capsys):
     (tmp_path / "lens.json").write_text(json.dumps(profile))
     write_clip(tmp_path / "clip.mp4", take(TIMING, SHAKING, count=16, fisheye=lens["distortion_coeffs"]))
     steadied = (*steady_command(tmp_path / "clip.mp4", tmp_path), "--lens-profile", tmp_path / "lens.json")
-    assert "lens_profile belongs to a gyroscope: give gyroscope as well" in refused(capsys, *steadied)
+    assert "--lens-profile belongs to a gyroscope: give gyroscope as well" in refused(capsys, *steadied)
     assert rsvib(*steadied, "--gyroscope", place / "rates.csv") == 0
     assert shaking(tmp_path / "out" / "restored.mp4") < 0.15  # 0.54 without, or the alignment is refused
     assert rsv.read_manifest(tmp_path / "out" / "manifest.json").gyroscope["focal_length"] == FOCAL_LENGTH
