@@ -207,13 +207,14 @@ def drawn(kind: str, draw: Generator) -> Curve:
 
 
 def free_motion(kind: str, number: int) -> Iterator[Error]:
-    """Errors of the displacement of the rows of each axis, rms over the rows, and of what differs between frames."""
+    """Errors of the rows of each reliable axis, and of what differs between frames, rms over the rows."""
     draw = generator_of(kind, number)
     motion = drawn(kind.removeprefix("free motion: "), draw)
     found = rsv.detect_motion(recorded(motion, FRAMES, draw), TIMING)
     error = found.displacement.numpy() - motion.displacement(found.times.numpy())
     error = (error - error.mean((0, 1)))[:, ::16]
-    for value, std in zip(error.ravel(), found.std.numpy()[:, ::16].ravel(), strict=True):
+    error, stds = (values[..., found.reliable.numpy()].ravel() for values in (error, found.std.numpy()[:, ::16]))
+    for value, std in zip(error, stds, strict=True):
         yield "displacement of rows", float(value), float(std), math.nan
     moments = (TIMING.row_starts(FRAMES, ROWS) + 0.5 * TIMING.exposure_time).numpy()
     truth = motion.displacement(moments)
