@@ -43,12 +43,10 @@ LAYERS: tuple[dict[str, str], ...] = (
 INNER_LAYERS: dict[str, tuple[set[str], ...]] = {
     "detection": (
         {"measurements"},
-        {"strips"},
         {"tones"},
         {"start", "spectrum"},
-        {"result"},
         {"rows", "sensitivity", "verdict"},
-        {"assemble", "convergence"},
+        {"result", "convergence"},
         {"refinement"},
         {"pipeline"},
         {"attempts"},

@@ -3,7 +3,7 @@
 import torch
 
 from rsvib_torch import DetectionResult, OffsetCurve, VibrationStd
-from rsvib_torch.detection.result import TimingSensitivity
+from rsvib_torch.detection.sensitivity import TimingSensitivity
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.results.reason import Reason
 

@@ -21,13 +21,11 @@ from typing import Literal
 
 import numpy as np
 
-from rsvib_torch.detection.assemble import assembled
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.pipeline import Attempt, DetectionOptions, Hypothesis, attempt
-from rsvib_torch.detection.result import DetectionResult
+from rsvib_torch.detection.result import DetectionResult, assembled
 from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
-from rsvib_torch.detection.start import strips_fit
-from rsvib_torch.detection.strips import FieldScale
+from rsvib_torch.detection.start import FieldScale, strips_fit
 from rsvib_torch.detection.tones.fit import MotionModel, tone_displacements
 from rsvib_torch.detection.tones.selection import MIN_SIGNIFICANCE, find_tones, robust_fit, typical_size
 from rsvib_torch.detection.verdict import contradicted_axes, halves_move_apart, rotation_possible

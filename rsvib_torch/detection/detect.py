@@ -8,7 +8,7 @@ from rsvib_torch.checks.values import check_choice
 from rsvib_torch.detection.attempts import FieldOptions, detect_tones
 from rsvib_torch.detection.pipeline import METHODS, DetectionOptions
 from rsvib_torch.detection.result import DetectionResult
-from rsvib_torch.detection.strips import camera_in_row_order
+from rsvib_torch.detection.start import camera_in_row_order
 from rsvib_torch.detection.tones.fit import MotionModel
 from rsvib_torch.execution.parallel import full_precision, threads_for, without_gradients
 from rsvib_torch.frames.entry_points import TimedModule, frames_options, module_options

@@ -24,7 +24,7 @@ class Measurements:
     Every scene row n is measured in a group of G frames (two of them give an offset). The position of the scene itself
     is unknown, so only differences within a group are measured: the mean over the group is subtracted from the
     displacements, and from every model that is compared with them. With roll and zoom, displacements have three or four
-    components instead of two, those of ``displacement_at`` times a length in px (``detection.strips``).
+    components instead of two, those of ``displacement_at`` times a length in px (``detection.start``).
     """
 
     exposure_starts: Array  # (B, N, G) float64 s, exposure start of the row of each frame that contains scene row n

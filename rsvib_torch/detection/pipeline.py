@@ -12,13 +12,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rsvib_torch.detection.assemble import offset_curve
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.refinement import FittedRows, refine, with_better
+from rsvib_torch.detection.result import offset_curve
 from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_intervals
 from rsvib_torch.detection.rows.grouped_frames import grouped_frames, grouped_strips
-from rsvib_torch.detection.start import BandStart, band_start, field_start
-from rsvib_torch.detection.strips import FieldScale
+from rsvib_torch.detection.start import BandStart, FieldScale, band_start, field_start
 from rsvib_torch.detection.tones.fit import (
     MotionModel,
     ToneFit,

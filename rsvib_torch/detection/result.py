@@ -1,70 +1,44 @@
-"""Result of detection: vibration, standard deviations, verdict, and the offset curve."""
+"""Result of detection: vibration, standard deviations, verdict, and the offset curve; how it is assembled.
+
+Detection works in row order with all components of the motion in px. A ``DetectionResult`` has image axes (x, y), roll
+in rad and zoom relative.
+"""
 
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
+from rsvib_torch.detection.sensitivity import TimingSensitivity, assumptions, timing_sensitivity, with_row_time_std
 from rsvib_torch.detection.spectrum import DisplacementSpectrum, displacement_spectrum
+from rsvib_torch.detection.start import FieldScale
+from rsvib_torch.detection.tones.fit import ToneFit, model_displacements, motion_of_fit
+from rsvib_torch.detection.verdict import contradicted_axes
 from rsvib_torch.files.reading import Table
+from rsvib_torch.frames.prepare import (
+    findings_from_row_order,
+    magnitudes_from_row_order,
+    offsets_from_row_order,
+    sequence_from_row_order,
+)
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
+from rsvib_torch.numerics.tables import Array
 from rsvib_torch.registration import OffsetCurve
-from rsvib_torch.results.presentation import Result, axis_head, axis_rows, plain_values
+from rsvib_torch.results.presentation import Result, axis_head, plain_values
 from rsvib_torch.results.reason import Findings
 from rsvib_torch.text import measured_text, text_table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-_TONE_VALUES = ("amplitude", "frequency")
-_SENSITIVITY_SHAPES = {
-    f"{value}_by_{time}": "... A K"
-    for time in ("row_time", "frame_rows", "exposure_rows")
-    for value in (*_TONE_VALUES, "phase")
-}
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class TimingSensitivity(Result, shapes=_SENSITIVITY_SHAPES):
-    """Relative change of amplitudes and frequencies, and change of phases, over the relative change of a stated time.
-
-    ``d ln A / d ln frame_rows = 3`` means that an amplitude becomes 3 % larger if ``frame_rows`` is stated 1 % larger
-    and the frames are the same. All values have the shape (..., 2, K), axes (x, y), 0 where there is no tone. A change
-    of ``row_time`` changes exposure time and frame period alike; with ``frame_start_times``, ``frame_rows`` has no
-    effect.
-    """
-
-    amplitude_by_row_time: Tensor  # d ln A / d ln row_time
-    amplitude_by_frame_rows: Tensor  # d ln A / d ln frame_rows
-    amplitude_by_exposure_rows: Tensor  # d ln A / d ln exposure_rows
-    frequency_by_row_time: Tensor  # d ln f / d ln row_time
-    frequency_by_frame_rows: Tensor  # d ln f / d ln frame_rows
-    frequency_by_exposure_rows: Tensor  # d ln f / d ln exposure_rows
-    phase_by_row_time: Tensor  # d phi / d ln row_time in rad, at the time origin
-    phase_by_frame_rows: Tensor  # d phi / d ln frame_rows
-    phase_by_exposure_rows: Tensor  # d phi / d ln exposure_rows
-
-    def summary(self) -> str:
-        """Changes of every tone if a time is stated 1 % larger; of a batch, of the strongest one of each axis."""
-        shown = 1 if self.batch_shape else self.frequency_by_row_time.shape[-1]
-        rows = [
-            [
-                *labels,
-                str(tone + 1),
-                name,
-                *(f"{float(getattr(self, f'{of}_by_{name}')[at][tone]):+.2f}" for of in _TONE_VALUES),
-            ]
-            for at, labels in axis_rows(self.batch_shape)
-            for tone in range(shown)
-            if tone == 0 or float(self.frequency_by_row_time[at][tone]) != 0.0
-            for name in ("row_time", "frame_rows", "exposure_rows")
-        ]
-        return text_table([*axis_head(self.batch_shape), "tone", "1 % of", *(f"{of} (%)" for of in _TONE_VALUES)], rows)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -231,3 +205,98 @@ class DetectionResult(
             fitted=self.fitted[..., :count],
             sensitivity=self.sensitivity.mapped(first),
         )
+
+
+def assembled(
+    fit: ToneFit,
+    std: VibrationStd,
+    std_if_hidden_tone: VibrationStd | None,
+    offsets: tuple[OffsetCurve, Array],
+    findings: Sequence[Findings],
+    timing: SensorTiming,
+    *,
+    scale: FieldScale,
+    num_frames: int,
+    interval: float,
+    blur: Array | None = None,
+) -> DetectionResult:
+    """The results of B stacks in image axes, from the fit and the standard deviations of its vibration in px.
+
+    ``offsets`` are those that were measured and those (B, P, N, A) in px that the fit predicts; ``findings`` are the
+    reasons against each axis in row order; the timing is in image order, and ``interval`` in s is that between two
+    frames, for the gain. ``blur`` (B, 3) as in ``OtherMotion`` is None if it was not measured.
+    """
+    row_timing, (curve, fitted) = timing.in_row_order(), offsets
+    predicted = torch.from_numpy(fitted).to(curve.offsets.device)
+    units = scale.units(predicted)
+    vibration = scale.motion(motion_of_fit(fit)).from_row_order(timing)
+    sensitivity = timing_sensitivity(fit, row_timing, num_frames, scale.height)
+    sensitivity = sensitivity.mapped(lambda values: magnitudes_from_row_order(values, timing, -2))
+    heights = sequence_from_row_order(curve.heights, timing)
+    residual = (curve.offsets - predicted).abs().nanmean(dim=(1, 2))
+    reliable = [[not of_axis for of_axis in of_stack] for of_stack in findings]
+    # The axes of a stack have one timing, which the rows of one of them may contradict.
+    contradicted = [any(contradicted_axes(of_stack)) and not all(of_stack) for of_stack in findings]
+    stds = [
+        of and with_row_time_std(scale.std(of).from_row_order(timing), vibration, sensitivity, timing)
+        for of in (std, std_if_hidden_tone)
+    ]
+    assert stds[0] is not None
+    return DetectionResult(
+        vibration=vibration,
+        std=stds[0],
+        std_if_hidden_tone=stds[1],
+        offsets=replace(
+            curve,
+            offsets=offsets_from_row_order(curve.offsets * units, timing),
+            std=None if curve.std is None else magnitudes_from_row_order(curve.std * units, timing),
+            heights=(heights[0], heights[1]),
+        ),
+        fitted=offsets_from_row_order(predicted * units, timing),
+        gain=vibration.gain(interval),
+        residual=magnitudes_from_row_order(residual * units, timing),
+        reliable=magnitudes_from_row_order(torch.tensor(reliable, device="cpu"), timing),
+        findings=tuple(findings_from_row_order(of_stack, timing) for of_stack in findings),
+        sensitivity=sensitivity,
+        assumptions=assumptions(vibration, sensitivity, row_timing, num_frames, scale.height, blur, contradicted),
+        timing=timing,
+    ).to(curve.offsets.device)
+
+
+def offset_curve(
+    measurements: Measurements, fit: ToneFit, robust_weights: Array, group_frames: Sequence[int], device: torch.device
+) -> tuple[OffsetCurve, Array]:
+    """Measured offsets between consecutive frames of groups, and those (B, P, N, A) in px that a fit predicts."""
+    count = measurements.displacements.shape[1] // len(group_frames)
+    parts = [
+        (slice(number * count, (number + 1) * count), slice(frame, frame + 2))
+        for number, frames in enumerate(group_frames)
+        for frame in range(frames - 1)
+    ]
+
+    def of_pairs(values: Array) -> Array:
+        """Values (B, N, G, ...) of the earlier and the later frame of each pair, (2, B, P, N, ...)."""
+        return np.moveaxis(np.stack([values[:, rows, frames] for rows, frames in parts], 1), 3, 0)
+
+    def of_rows(values: Array) -> Array:
+        return np.stack([values[:, rows] for rows, _ in parts], 1)
+
+    starts, later_starts = of_pairs(measurements.exposure_starts)
+    before, after = of_pairs(measurements.displacements)
+    everywhere = replace(measurements, visible=np.ones_like(measurements.visible))
+    fitted_before, fitted_after = of_pairs(model_displacements(everywhere, fit))
+    weights, robust = of_rows(measurements.weights), of_rows(robust_weights)
+    measured = (of_pairs(measurements.visible).min(0) > 0) & (weights > 0).any(-1)
+    frames = np.arange(len(parts))
+    values = {
+        "pairs": np.stack([frames, frames + 1], -1),
+        "rows": BLOCK_ROWS * (np.arange(count) + 0.5) - 0.5,
+        "times": starts,
+        "later_times": later_starts,
+        "offsets": np.where(measured[..., None], after - before, np.nan),
+        "quality": np.where(measured, robust.min(-1), 0.0),
+        "std": np.sqrt(np.where(weights > 0, 2.0 * robust / np.maximum(weights, 1e-300), np.nan)),  # of a difference
+    }
+    on_device = {name: torch.from_numpy(array).to(device) for name, array in values.items()}
+    curve = OffsetCurve(**on_device, heights=(BLOCK_ROWS, BLOCK_ROWS))
+    return curve, fitted_after - fitted_before

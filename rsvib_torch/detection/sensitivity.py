@@ -5,22 +5,68 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.result import TimingSensitivity
 from rsvib_torch.detection.tones.fit import ToneFit, free_jacobian, model_displacements
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming, other_intervals
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.numerics.tables import Array, pseudo_inverse, split_axis, table, tables, tensor
-from rsvib_torch.results.presentation import AXIS_NAMES
+from rsvib_torch.results.presentation import AXIS_NAMES, Result, axis_head, axis_rows
+from rsvib_torch.text import text_table
+
+_TONE_VALUES = ("amplitude", "frequency")  # quantities whose change by a wrong timing is stated
+_SENSITIVITY_SHAPES = {
+    f"{value}_by_{time}": "... A K"
+    for time in ("row_time", "frame_rows", "exposure_rows")
+    for value in (*_TONE_VALUES, "phase")
+}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class TimingSensitivity(Result, shapes=_SENSITIVITY_SHAPES):
+    """Relative change of amplitudes and frequencies, and change of phases, over the relative change of a stated time.
+
+    ``d ln A / d ln frame_rows = 3`` means that an amplitude becomes 3 % larger if ``frame_rows`` is stated 1 % larger
+    and the frames are the same. All values have the shape (..., 2, K), axes (x, y), 0 where there is no tone. A change
+    of ``row_time`` changes exposure time and frame period alike; with ``frame_start_times``, ``frame_rows`` has no
+    effect.
+    """
+
+    amplitude_by_row_time: Tensor  # d ln A / d ln row_time
+    amplitude_by_frame_rows: Tensor  # d ln A / d ln frame_rows
+    amplitude_by_exposure_rows: Tensor  # d ln A / d ln exposure_rows
+    frequency_by_row_time: Tensor  # d ln f / d ln row_time
+    frequency_by_frame_rows: Tensor  # d ln f / d ln frame_rows
+    frequency_by_exposure_rows: Tensor  # d ln f / d ln exposure_rows
+    phase_by_row_time: Tensor  # d phi / d ln row_time in rad, at the time origin
+    phase_by_frame_rows: Tensor  # d phi / d ln frame_rows
+    phase_by_exposure_rows: Tensor  # d phi / d ln exposure_rows
+
+    def summary(self) -> str:
+        """Changes of every tone if a time is stated 1 % larger; of a batch, of the strongest one of each axis."""
+        shown = 1 if self.batch_shape else self.frequency_by_row_time.shape[-1]
+        rows = [
+            [
+                *labels,
+                str(tone + 1),
+                name,
+                *(f"{float(getattr(self, f'{of}_by_{name}')[at][tone]):+.2f}" for of in _TONE_VALUES),
+            ]
+            for at, labels in axis_rows(self.batch_shape)
+            for tone in range(shown)
+            if tone == 0 or float(self.frequency_by_row_time[at][tone]) != 0.0
+            for name in ("row_time", "frame_rows", "exposure_rows")
+        ]
+        return text_table([*axis_head(self.batch_shape), "tone", "1 % of", *(f"{of} (%)" for of in _TONE_VALUES)], rows)
+
 
 _STEP = 1e-4  # relative change of the timing, for differences
-_CHANGED = ("amplitude", "frequency")  # quantities whose change by a wrong timing is stated
 
 
 def timing_sensitivity(fit: ToneFit, timing: RowTiming, num_frames: int, num_rows: int) -> TimingSensitivity:
@@ -146,7 +192,7 @@ def assumptions(
         times.insert(0, what.partition(",")[0])
     # 2. Effects on the tones of each stack.
     amplitudes, frequencies = tables(vibration.amplitude, vibration.frequency)
-    changes = {name: tables(*(getattr(sensitivity, f"{of}_by_{name}") for of in _CHANGED)) for name in times}
+    changes = {name: tables(*(getattr(sensitivity, f"{of}_by_{name}") for of in _TONE_VALUES)) for name in times}
     of_stacks = []
     for stack, frequency in enumerate(frequencies):
         tones = [(axis, tone, float(frequency[axis, tone])) for axis, tone in np.argwhere(amplitudes[stack] > 0)]
@@ -188,7 +234,7 @@ def _effects(name: str, tones: _Tones, changes: list[Array], timing: RowTiming) 
     """Sentence about the effect of an error of 1 % of a stated time on every tone; none if all are below 0.1 %."""
     of_tones = []
     for axis, tone, frequency in tones:
-        of_tone = zip(_CHANGED, (change[axis, tone] for change in changes), strict=True)
+        of_tone = zip(_TONE_VALUES, (change[axis, tone] for change in changes), strict=True)
         texts = [f"{of} {change:+.2g} %" for of, change in of_tone if abs(change) > 0.1]
         if texts:
             of_tones.append(f"{AXIS_NAMES[axis]} {frequency:.4g} Hz: {', '.join(texts)}")

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from rsvib_torch.checks.arguments import check_broadcast, check_images, checked_methods, checks_arguments
 from rsvib_torch.checks.values import check_choice
 from rsvib_torch.execution.parallel import full_precision, outside_graphs
-from rsvib_torch.files.free_memory import check_fits
+from rsvib_torch.files.reading import check_fits
 from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming

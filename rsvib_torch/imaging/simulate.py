@@ -10,7 +10,7 @@ from torch import Tensor
 
 from rsvib_torch.checks.arguments import ArrayLike, as_tensor, channels_appear_last, check_pixels, checks_arguments
 from rsvib_torch.checks.values import Count, check_single
-from rsvib_torch.files.free_memory import check_fits
+from rsvib_torch.files.reading import check_fits
 from rsvib_torch.frames.prepare import frames_from_row_order, frames_to_row_order
 from rsvib_torch.imaging.blur import form_rows
 from rsvib_torch.imaging.sensor_model import SensorNoise

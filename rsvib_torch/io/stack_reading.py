@@ -13,7 +13,7 @@ from torch import Tensor
 
 from rsvib_torch.checks.arguments import PathLike, checks_arguments
 from rsvib_torch.execution.progress import steps
-from rsvib_torch.files.free_memory import check_fits
+from rsvib_torch.files.reading import check_fits
 from rsvib_torch.frames.entry_points import LoadedFrames
 from rsvib_torch.io.formats import find_format
 from rsvib_torch.io.frame_reader import FrameReader, part_reader

@@ -20,7 +20,7 @@ from typing import IO, TYPE_CHECKING, Literal
 import numpy as np
 
 from rsvib_torch.checks.values import needed_package
-from rsvib_torch.files.free_memory import check_fits
+from rsvib_torch.files.reading import check_fits
 from rsvib_torch.io.frame_reader import FrameError, FrameReader, readable_stack
 from rsvib_torch.io.stack_info import H264, VIDEO, StackInfo, camera_name
 from rsvib_torch.numerics.tables import Array

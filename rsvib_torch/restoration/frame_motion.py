@@ -22,8 +22,7 @@ from torch import Tensor
 
 from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.values import check_whole_number, described
-from rsvib_torch.files.free_memory import check_fits
-from rsvib_torch.files.reading import Table
+from rsvib_torch.files.reading import Table, check_fits
 from rsvib_torch.frames.prepare import PreparedFrames, offsets_from_row_order
 from rsvib_torch.imaging.trajectory import exposure_trajectory, places, recorded_offsets, rows_and_displacement
 from rsvib_torch.motion.camera import largest_in_frame, largest_slope

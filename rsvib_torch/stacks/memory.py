@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import psutil
 
-from rsvib_torch.files.free_memory import check_fits, free_memory, size_text
+from rsvib_torch.files.reading import check_fits, free_memory, size_text
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.options import OptionTable
 from rsvib_torch.restoration.priors import PRIORS

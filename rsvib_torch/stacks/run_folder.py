@@ -30,8 +30,7 @@ import numpy as np
 from rsvib_torch.checks.arguments import check_fields
 from rsvib_torch.files import atomic
 from rsvib_torch.files.atomic import check_outputs, nearest_folder, sync
-from rsvib_torch.files.free_memory import size_text
-from rsvib_torch.files.reading import Table
+from rsvib_torch.files.reading import Table, size_text
 from rsvib_torch.io.stack_writing import stack_files
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import RunOptions

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.detection import DetectionResult
-from rsvib_torch.detection.assemble import assembled, offset_curve
 from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.detection.result import assembled, offset_curve
 from rsvib_torch.detection.sensitivity import timing_sensitivity, with_row_time_std
-from rsvib_torch.detection.strips import FieldScale
+from rsvib_torch.detection.start import FieldScale
 from rsvib_torch.detection.tones.fit import ToneFit, displacement_std, residual_of, vibration_of_fit
 from rsvib_torch.detection.verdict import Findings
 from rsvib_torch.frames.prepare import PreparedFrames, frames_from_row_order

@@ -30,7 +30,7 @@ from rsvib_torch.detection.rows.displacements import (
     measure_group,
     stack_spectra,
 )
-from rsvib_torch.detection.strips import FieldScale
+from rsvib_torch.detection.start import FieldScale
 from rsvib_torch.detection.tones.fit import (
     MIN_GAIN,
     MotionModel,

@@ -3,7 +3,7 @@
 import psutil
 import pytest
 
-from rsvib_torch.files.free_memory import check_fits, free_memory
+from rsvib_torch.files.reading import check_fits, free_memory
 
 GB = 10**9
 

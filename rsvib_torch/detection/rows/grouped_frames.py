@@ -27,7 +27,7 @@ from rsvib_torch.detection.rows.displacements import (
     uneven_motion,
 )
 from rsvib_torch.detection.rows.warping import differently_blurred
-from rsvib_torch.detection.strips import FieldScale
+from rsvib_torch.detection.start import FieldScale
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.motion.camera import largest_slope
 from rsvib_torch.motion.motion import ColumnMotion, ColumnStrips, Motion

@@ -27,8 +27,7 @@ from rsvib_torch.detection.rows.grouped_frames import (
 )
 from rsvib_torch.detection.sensitivity import displacements_by_row_time
 from rsvib_torch.detection.shapes.spline_fit import SplineFit, fit_spline
-from rsvib_torch.detection.start import BandStart, band_start
-from rsvib_torch.detection.strips import FieldScale, camera_in_row_order
+from rsvib_torch.detection.start import BandStart, FieldScale, band_start, camera_in_row_order
 from rsvib_torch.detection.tones.fit import ToneFit, fit_tones, fitted_again, motion_of_fit, residual_of
 from rsvib_torch.detection.tones.selection import find_tones, with_best_aliases
 from rsvib_torch.detection.tones.uncertainty import with_further_tones
