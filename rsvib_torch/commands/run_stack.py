@@ -83,7 +83,8 @@ def run(given: RunOptions) -> Answer:
     followed = bool(given.moved) or (given.video and io.is_video(frames) and info.shape[0] > chosen.window)
     result = _process_video(given, out / output, common) if followed else _process(given, out / output, common, chosen)
     manifest = stacks.read_manifest(result.manifest)
-    if result.resumed == result.windows and (out / "tones.csv").exists() and not given.report:
+    complete = result.resumed == result.windows and not given.report and given.pixel_size is None
+    if complete and _is_newer(out / "tones.csv", result.manifest):  # else it is of a run that was replaced
         answer = answers.windows_answer(f"Vibration in {frames.name}", manifest, result)
         answer.files += [out / name for name in dict.fromkeys((output, *_RESULTS)) if (out / name).exists()]
         return answer
@@ -115,6 +116,10 @@ def run(given: RunOptions) -> Answer:
         answers.remove_old(out, _RESULTS, names)
     answer.files += [out / name for name in names]
     return answer
+
+
+def _is_newer(table: Path, manifest: Path) -> bool:
+    return table.exists() and table.stat().st_mtime_ns >= manifest.stat().st_mtime_ns
 
 
 def _name_of_output(given: RunOptions) -> str:

@@ -83,6 +83,24 @@ def test_a_complete_run_is_not_computed_again(place, tmp_path, capsys, monkeypat
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "out").iterdir()} == files
 
 
+def test_a_complete_run_writes_tables_with_another_unit_or_in_place_of_those_of_another_run(
+    place, tmp_path, monkeypatch
+):
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    arguments, table = command(place, "run", tmp_path / "out"), tmp_path / "out" / "tones.csv"
+    assert rsvib(*arguments) == 0
+    assert rsvib(*arguments, "--resume", "--pixel-size", "5um") == 0
+    assert "amplitude_um" in table.read_text()
+    with monkeypatch.context() as patch:
+        patch.setattr("rsvib_torch.commands.answers.write_detection", stop)
+        assert rsvib(*arguments, "--overwrite") == 130
+    assert "amplitude_um" in table.read_text()
+    assert rsvib(*arguments, "--resume") == 0
+    assert "amplitude_um" not in table.read_text()
+
+
 def test_a_session_that_is_stopped_before_it_begins_is_one_line(place, tmp_path, capsys, monkeypatch):
     def stop(*_, **__):
         raise KeyboardInterrupt
