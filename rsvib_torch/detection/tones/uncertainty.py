@@ -274,14 +274,11 @@ def with_unknown_image_motion(stated: "StatedFit", interval: float, exposure_tim
 
     They are not part of the displacement of rows, whose errors are those without image motion.
     """
-    fit, drifts = stated.fit, stated.fit.drift.shape[-1]
-    if drifts == 0:
-        return stated
-    axes = fit.amplitude.shape[1]
+    fit, axes = stated.fit, stated.fit.amplitude.shape[1]
     error = np.array(_DRIFT_BY_BLUR)[:axes] * np.square(_path_within(fit, exposure_time)).sum(-1) / interval  # px/s
     covariance = fit.covariance.copy()
     parameters = covariance.shape[-1] // axes
-    velocity = np.arange(axes) * parameters + parameters - drifts
+    velocity = np.arange(axes) * parameters + parameters - fit.drift_order
     covariance[:, velocity, velocity] += np.square(error)
     return replace(stated, fit=replace(fit, covariance=covariance))
 
