@@ -53,7 +53,6 @@ Frames = Annotated[int, Field(ge=2, le=2**31)]
 Side = Annotated[float, Field(gt=0.0, le=0.4)]  # parts of a frame; more leaves less than a fifth of it
 COMMAND_LINE: JsonDict = {"command_line": True}  # mark of fields that are options of commands as well
 MAX_TONES = 4  # tones of one axis; a record of a few frames does not resolve more
-MAX_HARMONICS = 50  # the sensors of the paper sample a tone of 100 Hz up to its 120th harmonic
 
 
 @options
@@ -120,8 +119,6 @@ class ToneOptions(ProjectionOptions, RegistrationOptions):
     tones: Annotated[int, Field(ge=1, le=MAX_TONES)] | Literal["auto"] = "auto"
     """Number of tones of each axis, 1 to 4, or ``"auto"`` to select it by significance; the standard deviations then
     allow for a further tone."""
-    harmonics: int = Field(default=1, ge=1, le=MAX_HARMONICS)
-    """Number of multiples of every tone, with one common base frequency; 1 for independent tones."""
     image_acceleration: bool = False
     """Whether the image motion has a constant acceleration."""
     columns: Columns | None = None

@@ -124,7 +124,7 @@ CASES = (
             lambda frames: rsv.detect_motion(np.stack([frames, frames])[:, :, None], TIMING)[1],
             FRAMES,
         ),
-        "detect_vibration, bands": (partial(detect, method="bands", harmonics=2), FRAMES),
+        "detect_vibration, bands": (partial(detect, method="bands", tones=2), FRAMES),
         "align_motion": (lambda frames: rsv.align_motion(frames, TIMING, MOTION, offsets=(-0.002, 0.002)), FRAMES),
         "restore, holes": (lambda frames, ignore: restore(frames, ignore=ignore, **HARD), FRAMES, FRAMES > 0.8),
         "RowVaryingBlur.A_adjoint": (rsv.RowVaryingBlur(PSF).A_adjoint, FRAMES[0, :8]),

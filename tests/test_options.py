@@ -33,7 +33,7 @@ def test_functions_have_the_fields_as_keyword_arguments(function, leading, optio
 def test_values_are_kept_or_refused_but_not_converted():
     options = ToneOptions(tones=np.int64(2), principal_point=np.array([1, 2.5]), focal_length=900)
     assert (options.tones, options.principal_point, options.focal_length) == (2, (1.0, 2.5), 900.0)
-    assert pickle.loads(pickle.dumps(options)) == replace(options, harmonics=1)
+    assert pickle.loads(pickle.dumps(options)) == replace(options, search=16)
     with pytest.raises(FrozenInstanceError):
         options.tones = 3
     for value, error in ((2.0, TypeError), ("2", TypeError), (True, TypeError), (5, ValueError)):

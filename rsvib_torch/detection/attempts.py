@@ -26,7 +26,7 @@ from rsvib_torch.detection.pipeline import Attempt, DetectionOptions, Hypothesis
 from rsvib_torch.detection.result import DetectionResult, assembled
 from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
 from rsvib_torch.detection.start import FieldScale, strips_fit
-from rsvib_torch.detection.tones.fit import MotionModel, tone_displacements
+from rsvib_torch.detection.tones.fit import tone_displacements
 from rsvib_torch.detection.tones.selection import MIN_SIGNIFICANCE, find_tones, robust_fit, typical_size
 from rsvib_torch.detection.verdict import contradicted_axes, halves_move_apart, rotation_possible
 from rsvib_torch.frames.prepare import GreyFrames
@@ -265,7 +265,7 @@ def period_factor(measurements: Measurements, timing: RowTiming, num_frames: int
             fit = find_tones(trial, interval, 1, stretches=False, iterations=_ITERATIONS)
         else:
             active = np.ones_like(frequencies, dtype=bool)
-            fit, _ = robust_fit(trial, frequencies, active, MotionModel(), iterations=_ITERATIONS)
+            fit, _ = robust_fit(trial, frequencies, active, iterations=_ITERATIONS)
         return typical_size(trial, fit), fit.frequencies
 
     # 1. The stated timing, reversed readout, and other frame periods on a coarse grid.

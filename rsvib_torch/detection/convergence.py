@@ -84,7 +84,7 @@ class Acceleration:
             return None
         corrected = replace(measurements, displacements=measurements.displacements - self._correction())
         residual = residual_of(corrected, fit)
-        return robust_fit(corrected, fit.frequencies, fit.active, fit.model, residual, steps=1)[0]
+        return robust_fit(corrected, fit.frequencies, fit.active, fit.drift_order, residual, steps=1)[0]
 
     def _correction(self) -> Array:
         """Displacements (B, N, G, A) in px to subtract."""

@@ -9,7 +9,6 @@ from rsvib_torch.detection.attempts import FieldOptions, detect_tones
 from rsvib_torch.detection.pipeline import METHODS, DetectionOptions
 from rsvib_torch.detection.result import DetectionResult
 from rsvib_torch.detection.start import camera_in_row_order
-from rsvib_torch.detection.tones.fit import MotionModel
 from rsvib_torch.execution.parallel import full_precision, threads_for, without_gradients
 from rsvib_torch.frames.entry_points import TimedModule, frames_options, module_options
 from rsvib_torch.frames.prepare import grey_frames
@@ -81,8 +80,8 @@ def detect_vibration(frames: FramesOrFiles, timing: SensorTiming, options: Vibra
     if options.roll is False and zoom:
         raise ValueError("zoom=True measures roll as well, and roll=False excludes it; pass roll=True, or zoom=False")
     field = FieldOptions(options.roll, zoom, camera)
-    model = MotionModel(options.harmonics, 2 if options.image_acceleration else 1)
-    chosen = DetectionOptions(options.method, None if options.tones == "auto" else options.tones, model, options)
+    tones, drift_order = None if options.tones == "auto" else options.tones, 2 if options.image_acceleration else 1
+    chosen = DetectionOptions(options.method, tones, drift_order, options)
     if options.columns is not None:
         if camera is not None or options.roll is True or options.zoom is True:
             raise ValueError(

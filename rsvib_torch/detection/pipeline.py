@@ -19,7 +19,6 @@ from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_
 from rsvib_torch.detection.rows.grouped_frames import grouped_frames, grouped_strips
 from rsvib_torch.detection.start import BandStart, FieldScale, band_start, field_start
 from rsvib_torch.detection.tones.fit import (
-    MotionModel,
     ToneFit,
     displacement_std,
     fit_tones,
@@ -54,13 +53,13 @@ class DetectionOptions:
 
     method: DetectionMethod  # how tones are fitted
     tones: int | None  # number of tones of each axis; None to select it by significance
-    model: MotionModel  # harmonics and order of the image motion
+    drift_order: int  # of the image motion: 1 for a uniform one, 2 for a uniformly accelerated one
     bands: RegistrationOptions  # registration of the row bands
 
     @property
     def max_tones(self) -> float:
         """Largest number of tones that are tried on an axis; infinite if the number is given."""
-        return MAX_TONES if self.tones is None and self.model.harmonics == 1 else math.inf
+        return MAX_TONES if self.tones is None else math.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +130,8 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
         start = field_start(stacks, timing, options.bands, scale, hypothesis.translation)
     if hypothesis.frequencies is not None:
         active = np.ones_like(hypothesis.frequencies, dtype=bool)
-        start = replace(start, fit=robust_fit(start.measurements, hypothesis.frequencies, active, options.model)[0])
+        fit, _ = robust_fit(start.measurements, hypothesis.frequencies, active, options.drift_order)
+        start = replace(start, fit=fit)
 
     # 2. Fit: tones and image motion, to the bands or to the rows.
     fitted = method.fit(start, stacks, timing, options, hypothesis)
@@ -149,7 +149,7 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
         measurements, fit = _with_errors_of_scene(refined, fitted.fit, intervals, timing)
         small = too_small(fit, intervals, timing.exposure_time) & (fit.amplitude < fit.amplitude.max(-1, keepdims=True))
         if options.max_tones < math.inf and small.any():  # aliasing was taken for further tones
-            kept = fit_tones(measurements, fit, fit.active & ~small, fit.model)
+            kept = fit_tones(measurements, fit, fit.active & ~small)
             measurements, fit = _with_errors_of_scene(refined, kept, intervals, timing)
     known_std = displacement_std(fit, row_starts, timing.exposure_time)
     stated, if_hidden = with_further_tones(measurements, fit, row_starts, number_is_known=options.tones is not None)
@@ -271,9 +271,8 @@ def _tones_of_bands(start: BandStart, timing: RowTiming, options: DetectionOptio
     """Tones and image motion of the offsets of row bands; further tones until residuals are below ``accuracy`` px."""
     interval = options.bands.band_step * timing.row_time
     blind = table(blind_frequencies(timing, 0.5 / interval))
-    return find_tones(
-        start.measurements, interval, options.tones, options.model, start=start.fit, blind=blind, accuracy=accuracy
-    )
+    chosen = options.tones, options.drift_order
+    return find_tones(start.measurements, interval, *chosen, start=start.fit, blind=blind, accuracy=accuracy)
 
 
 METHODS: dict[DetectionMethod, Method] = {

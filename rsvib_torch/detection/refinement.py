@@ -90,7 +90,7 @@ def refine(
             break
         tried = tried | mirrored
         active, index = strongest_only(refined.fit).active, np.flatnonzero(mirrored.any(-1))
-        other, _ = robust_fit(refined.measurements, frequencies, active, start.model)
+        other, _ = robust_fit(refined.measurements, frequencies, active, start.drift_order)
         # a pattern that was subtracted does not appear again
         again = _rounds(refined.frames.stacks(index), intervals, take_stacks([other], index), tones, False, has_pattern)
         refined = with_better(refined, again, index)
@@ -222,7 +222,8 @@ class Refinement:
         # 2. Fit the motion to them, and keep the last fit of a stack whose fit diverges.
         fit = self._searched(measurements, residual) if number == self.search_round else None
         if fit is None:
-            fit = robust_fit(measurements, previous.frequencies, previous.active, previous.model, residual, steps=1)[0]
+            of_tones = previous.frequencies, previous.active, previous.drift_order
+            fit = robust_fit(measurements, *of_tones, residual, steps=1)[0]
         fit = self.fit = self._bounded(fit, previous)
         same_tones = np.array_equal(previous.active, fit.active)
         self._fits = [*self._fits, fit] if same_tones and number > self.search_round else [fit]
@@ -337,7 +338,7 @@ class Refinement:
         """Fit with further tones. The noise of rows is nearly white: a tone that explains 2 % is significant."""
         independent = replace(measurements, independent=measurements.independent_fraction(residual))
         start = with_best_aliases(independent, strongest_only(self.fit))
-        return find_tones(independent, self._sample_interval, self._tones, start.model, 0.02, start, self._blind)
+        return find_tones(independent, self._sample_interval, self._tones, start.drift_order, 0.02, start, self._blind)
 
     def _bounded(self, fit: ToneFit, previous: ToneFit) -> ToneFit:
         """The fit, with the previous one for stacks whose fit diverges."""
@@ -417,7 +418,7 @@ def mirrored_frequencies(measurements: Measurements, fit: ToneFit, start: ToneFi
     unresolved = (np.abs(mirrored - frequency) * duration < 0.35) & (mirrored > 0) & strongest.active[..., 0]
     wrong = (residual > 3.0) & (residual == residual.max(-1, keepdims=True))
     where = unresolved & ~tried & (wrong | _is_nearly_blind(fit, interval[0]))
-    if fit.model.harmonics > 1 or exposure_starts.shape[2] > 2:
+    if exposure_starts.shape[2] > 2:
         where = np.zeros_like(where)
     return np.where(where, mirrored, strongest.frequencies[..., 0])[..., None], where
 

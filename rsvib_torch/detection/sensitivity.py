@@ -90,9 +90,9 @@ def timing_sensitivity(fit: ToneFit, timing: RowTiming, num_frames: int, num_row
     fit = fit.about(whole.centre)
 
     # 2. The pseudo-inverse of the derivatives of the displacements of each axis by its parameters.
-    jacobian, to_all = free_jacobian(whole, fit)
-    columns = np.moveaxis(jacobian, 3, 1).reshape(batch, axes, -1, to_all.shape[-1])
-    inverses = to_all @ pseudo_inverse(columns)  # (B, A, P, D)
+    jacobian = free_jacobian(whole, fit)
+    columns = np.moveaxis(jacobian, 3, 1).reshape(batch, axes, -1, jacobian.shape[-1])
+    inverses = pseudo_inverse(columns)  # (B, A, P, D)
 
     # 3. The change of the tones by a change of each time, the tones in the order of a ``Vibration``.
     values = {}

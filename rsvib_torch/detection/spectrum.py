@@ -15,7 +15,7 @@ from torch import Tensor
 
 from rsvib_torch.checks.values import check_single
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.tones.fit import MotionModel, ToneFit, fit_roughly, motion_of_fit
+from rsvib_torch.detection.tones.fit import ToneFit, fit_roughly, motion_of_fit
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.numerics.interpolation import fourier_sums
@@ -220,7 +220,7 @@ def _spectrum(measured: Measurements, frequency: Array, known: Array) -> tuple[A
 def _fitted(measured: Measurements, frequencies: Array) -> tuple[ToneFit, Array]:
     """The lines of an axis, fitted from frequencies (L,), and the residual displacements."""
     start = frequencies[None, None]
-    return fit_roughly(measured, start, np.ones_like(start, dtype=bool), MotionModel(drift_order=2), iterations=3)
+    return fit_roughly(measured, start, np.ones_like(start, dtype=bool), drift_order=2, iterations=3)
 
 
 def _lines_of(vibration: Vibration, axis: int, centre: Array) -> Array:
@@ -239,4 +239,4 @@ def _fit_of_lines(lines: tuple[Array, ...], centre: Array) -> ToneFit:
         values[:, 0, axis, : len(of_axis)] = of_axis.T
     frequencies, coefficients = values
     drift, covariance = np.zeros((1, len(lines), 1)), np.zeros((1, 0, 0))
-    return ToneFit(coefficients, frequencies.real, coefficients != 0, drift, covariance, centre, MotionModel())
+    return ToneFit(coefficients, frequencies.real, coefficients != 0, drift, covariance, centre)

@@ -19,7 +19,7 @@ from scipy.linalg import block_diag
 from scipy.special import softmax
 
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.tones.fit import MotionModel, ToneFit
+from rsvib_torch.detection.tones.fit import ToneFit
 from rsvib_torch.numerics.tables import Array, median, split_axis, without_nan
 
 # Random walk of g and 2 pi f in rad/s per square root of a second, and of a in px/s^2 per square root of a second.
@@ -274,7 +274,6 @@ class ToneFilter:
             values[None, :, -2:],
             block_diag(*covariance)[None],
             np.array([self.time - origin]),
-            MotionModel(1, 2),
         )
 
 

@@ -33,7 +33,6 @@ from rsvib_torch.detection.rows.displacements import (
 from rsvib_torch.detection.start import FieldScale
 from rsvib_torch.detection.tones.fit import (
     MIN_GAIN,
-    MotionModel,
     ToneFit,
     motion_of_fit,
     offset_gain,
@@ -417,11 +416,11 @@ class VibrationTracker:
         middle = 0.5 * (times[0] + times[-1]) + 0.5 * height * self._rows.row_time
         timing = replace(self._rows, frame_start_times=tuple(time - middle for time in times))
         hypothesis = Hypothesis(FieldScale(2, stacks.images.shape[-1], height))
-        model = MotionModel(drift_order=2 if count > 2 else 1)
+        drift_order = 2 if count > 2 else 1
         only_bands = state.attempts > _DIRECT_ATTEMPTS and height >= _FEW_ROWS
         started = state
         for method, number in _STARTS[:1] if only_bands else _STARTS:
-            found = attempt(stacks, timing, DetectionOptions(method, number, model, _BANDS), hypothesis)
+            found = attempt(stacks, timing, DetectionOptions(method, number, drift_order, _BANDS), hypothesis)
             if scene_reasons(found.start.curve, stacks.images.shape[-1])[0] or not found.visible[0]:
                 break
             # Tones that the last frame contradicts are not used: without tones, the path is followed at least.

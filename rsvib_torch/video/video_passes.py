@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from rsvib_torch.detection.sensitivity import timing_sensitivity, with_row_time_std
-from rsvib_torch.detection.tones.fit import MotionModel, ToneFit
+from rsvib_torch.detection.tones.fit import ToneFit
 from rsvib_torch.execution.parallel import ONE_BLAS_THREAD, prefetched
 from rsvib_torch.gyroscope.corner_tracks import followed_pair, tracks_of_pairs
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
@@ -330,7 +330,6 @@ class VideoPasses:
             drift=velocity[None, :, None],
             covariance=np.empty((1, 0, 0)),
             centre=np.zeros(1),
-            model=MotionModel(),
         )
         rows = self.frames.size[int(timing.scan_axis)]
         sensitivity = timing_sensitivity(fit, timing.in_row_order(), len(tracks), rows)[0]

@@ -294,22 +294,14 @@ def test_uneven_frame_times_measure_a_blind_frequency(paper_camera):
     check(result, motion, 0.02, 0.3, 0.002)
 
 
-def test_harmonics_share_a_frequency(paper_camera):
+def test_multiples_of_a_frequency_are_found_as_tones(paper_camera):
     amplitude, frequency = np.array([[2.0, 0.5, 0.2], [1.0, 0.3, 0.1]]), np.array([[37.0], [61.0]]) * [1, 2, 3]
     phase = np.array([[0.1, 0.2, 0.3], [1.0, 2.0, 3.0]])
     motion = Curve(lambda t: (amplitude * np.sin(2 * np.pi * frequency * t[..., None, None] + phase)).sum(-1))
-    frames = recorded((2048, 256), paper_camera, motion, 3, 0.005, seed=55)
-    tied = detect_vibration(frames, paper_camera, harmonics=3)
-    free = detect_vibration(frames, paper_camera)
-    for result in (tied, free):
-        found = result.vibration
-        assert found.amplitude.shape == (2, 3)
-        assert (found.frequency / torch.from_numpy(frequency) - 1).abs().max() < 5e-4
-        assert (found.amplitude / torch.from_numpy(amplitude) - 1).abs().max() < 0.02
-    multiples = tied.vibration.frequency / tied.vibration.frequency[:, :1]
-    torch.testing.assert_close(multiples, torch.tensor([[1.0, 2.0, 3.0]] * 2).double(), rtol=1e-12, atol=0)
-    # the constraint reduces the standard deviation
-    assert bool((tied.std.frequency[:, 1:] < 0.5 * free.std.frequency[:, 1:]).all())
+    found = detect_vibration(recorded((2048, 256), paper_camera, motion, 3, 0.005, seed=55), paper_camera).vibration
+    assert found.amplitude.shape == (2, 3)
+    assert (found.frequency / torch.from_numpy(frequency) - 1).abs().max() < 5e-4
+    assert (found.amplitude / torch.from_numpy(amplitude) - 1).abs().max() < 0.02
 
 
 def test_accelerated_image_motion(paper_camera):

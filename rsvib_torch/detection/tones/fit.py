@@ -8,11 +8,9 @@ coupling of the scan with motion along it are part of the model, and all tones o
 import math
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 import torch
-from scipy.linalg import block_diag
 
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.files.reading import Table
@@ -38,16 +36,6 @@ LARGEST = (30.0, 30.0, 1.0, 1.0)
 # --- Model ---
 
 
-@dataclass(frozen=True)
-class MotionModel:
-    """Structure of the motion that is fitted."""
-
-    # tones come in families of a fundamental and its multiples up to this one, with one common frequency; 1 leaves all
-    # frequencies independent
-    harmonics: int = 1
-    drift_order: int = 1  # 1 for a uniform image motion, 2 for a uniformly accelerated one
-
-
 @dataclass(frozen=True, eq=False)
 class ToneFit:
     """Fitted motion ``D(t) = Re sum_k C_k exp(2 pi i f_k s) + sum_j d_j s^j / j!`` of each axis, s = t - centre."""
@@ -55,12 +43,16 @@ class ToneFit:
     coefficients: Array  # (B, 2, K) complex128 C in px
     frequencies: Array  # (B, 2, K) float64 f in Hz
     active: Array  # (B, 2, K) bool, tones that exist
-    drift: Array  # (B, 2, J) float64 d in px/s^j
+    drift: Array  # (B, 2, J) float64 d in px/s^j; J = 1 for a uniform image motion, 2 for an accelerated one
     # (B, 2 P, 2 P) float64 of the P = 3 K + J parameters [Re C, Im C, f of each tone, d] of x, then of y. With roll and
     # zoom there are A = 3 or 4 axes instead of 2, in the units of the measurements.
     covariance: Array
     centre: Array  # (B,) float64 s, the middle of the record, where phase and frequency are least correlated
-    model: MotionModel  # structure of the motion
+
+    @property
+    def drift_order(self) -> int:
+        """J, the order of the image motion."""
+        return self.drift.shape[-1]
 
     @property
     def tones(self) -> Array:
@@ -149,25 +141,6 @@ def _sinc(x: Array) -> tuple[Array, Array]:
     return value, (np.cos(math.pi * positive) - value) / positive
 
 
-@cache
-def _constraints(model: MotionModel, tones: int, axes: int) -> Array:
-    """Matrix (A (3 K + J), A M) from the free parameters of A axes to all: harmonics share a frequency."""
-    families = tones // model.harmonics
-    count = 2 * tones + families + model.drift_order
-    matrix = np.zeros((3 * tones + model.drift_order, count))
-    column = 0
-    for tone in range(tones):
-        harmonic = tone % model.harmonics
-        matrix[3 * tone, column] = matrix[3 * tone + 1, column + 1] = 1.0
-        if harmonic == 0:
-            of_frequency = column + 2
-        matrix[3 * tone + 2, of_frequency] = harmonic + 1.0
-        column += 3 if harmonic == 0 else 2
-    for power in range(model.drift_order):
-        matrix[3 * tones + power, column + power] = 1.0
-    return block_diag(*[matrix] * axes)
-
-
 @dataclass(frozen=True, eq=False)
 class _Estimate:
     """Parameters with their residual and normal equations."""
@@ -176,25 +149,23 @@ class _Estimate:
     jacobian: Array  # (B, N, G, 2, P) derivatives of the displacements of each axis by its parameters
     residual: Array  # (B, N, G, 2) px
     cost: Array  # (B,) weighted square of the residual
-    matrix: Array  # (B, M, M) normal matrix of the free parameters
+    matrix: Array  # (B, M, M) normal matrix of all M = A P parameters
     right: Array  # (B, M) its right-hand side
 
 
 class _Problem:
     """Nonlinear least squares ``min sum_n r_n^T W_n r_n`` of the rows for the ``active`` (B, 2, K) tones."""
 
-    def __init__(self, measurements: Measurements, active: Array, model: MotionModel) -> None:
-        self.measurements, self.active, self.model = measurements, active, model
-        (self.axes, self.tones), order = active.shape[1:], model.drift_order
-        self.to_all: Array | None = None  # (A P, M); None: all parameters are free
-        if model.harmonics > 1:
-            self.to_all = _constraints(model, self.tones, self.axes)
-        exists = np.pad(np.repeat(active, 3, -1), ((0, 0), (0, 0), (0, order)), constant_values=True)
+    def __init__(self, measurements: Measurements, active: Array, drift_order: int) -> None:
+        self.measurements, self.active = measurements, active
+        self.axes, self.tones = active.shape[1:]
+        exists = np.pad(np.repeat(active, 3, -1), ((0, 0), (0, 0), (0, drift_order)), constant_values=True)
         place = np.arange(exists.shape[-1])
         self.is_frequency = (place < 3 * self.tones) & (place % 3 == 2)  # (P,)
-        self.free, self.linear = (self._of_free(these) for these in (exists, exists & ~self.is_frequency))  # (B, M)
-        drifts = measurements.drifts[..., :order]
-        self.drift_columns = np.broadcast_to(drifts, (*drifts.shape[:3], self.axes, order))
+        # (B, M) bool, parameters that are fitted, and those of them on which displacements depend linearly
+        self.free, self.linear = (these.reshape(len(active), -1) for these in (exists, exists & ~self.is_frequency))
+        drifts = measurements.drifts[..., :drift_order]
+        self.drift_columns = np.broadcast_to(drifts, (*drifts.shape[:3], self.axes, drift_order))
         self.root = measurements.root[:, :, None]  # (B, N, 1, A, A)
 
     def of_stacks(self, index: Array) -> "_Problem":
@@ -205,11 +176,6 @@ class _Problem:
             setattr(part, name, getattr(self, name)[index])
         return part
 
-    def _of_free(self, parameters: Array) -> Array:
-        """(B, M) bool, free parameters that change any of the parameters (B, 2, P)."""
-        these = parameters.reshape(len(parameters), -1)
-        return these if self.to_all is None else these.astype(np.float64) @ self.to_all > 0
-
     def tones_of(self, values: Array) -> Array:
         """Tones (B, 2, K, 3) of parameters (B, 2, P), as in ``_jacobian_of_tones``."""
         return split_axis(values[..., : 3 * self.tones], -1, self.tones, 3)
@@ -217,8 +183,7 @@ class _Problem:
     def fit(self, values: Array, covariance: Array) -> ToneFit:
         """The parameters (B, 2, P) as a ``ToneFit``."""
         (real, imaginary, frequencies), drift = np.moveaxis(self.tones_of(values), -1, 0), values[..., 3 * self.tones :]
-        centre, model = self.measurements.centre, self.model
-        return ToneFit(real + 1j * imaginary, frequencies, self.active, drift, covariance, centre, model)
+        return ToneFit(real + 1j * imaginary, frequencies, self.active, drift, covariance, self.measurements.centre)
 
     def jacobian(self, values: Array) -> Array:
         """Derivatives (B, N, G, 2, P) of the displacements of each axis by its parameters (B, 2, P)."""
@@ -241,19 +206,13 @@ class _Problem:
 
     def covariance(self, state: _Estimate, deviation: Array) -> Array:
         """Covariance (B, 2 P, 2 P) for errors of a row of the covariance ``S W^-1 S``, S the deviations (B, 2)."""
-        inverse = self.inverse(state)
         # W = R^T R, and the whitened errors R e have the covariance T T^T with T = R S R^-1; T^T R = R^-T S W
         diagonal = self.root.diagonal(axis1=-2, axis2=-1)
         safe = self.root + (diagonal == 0)[..., None] * np.eye(self.axes)
         scaled = deviation[:, None, None, :, None] * (self.root.mT @ self.root)
         mixed = np.linalg.solve(safe.mT, scaled)  # (B, N, 1, A, A)
-        to_all = inverse if self.to_all is None else self.to_all @ inverse
-        columns = self._whitened(mixed, state.jacobian) @ to_all
-        return self._of_all(columns.mT @ columns)
-
-    def _of_all(self, covariance: Array) -> Array:
-        """Covariance (B, A P, A P) of all parameters from that (B, M, M) of the free ones."""
-        return covariance if self.to_all is None else self.to_all @ covariance @ self.to_all.T
+        columns = self._whitened(mixed, state.jacobian) @ self.inverse(state)
+        return columns.mT @ columns
 
     def inverse(self, state: _Estimate) -> Array:
         """Inverse (B, M, M) of the normal matrix of the free parameters; 0 for the others."""
@@ -277,7 +236,7 @@ class _Problem:
             meat = meat + (1 - lag / 3) * (product + product.mT)
         used = (np.abs(sums).max(-1) > 0).sum(-1)
         spent = self.free.sum(-1) / self.axes
-        return self._of_all(inverse @ meat @ inverse * (used / np.maximum(used - spent, 1.0))[:, None, None])
+        return inverse @ meat @ inverse * (used / np.maximum(used - spent, 1.0))[:, None, None]
 
     @staticmethod
     def _whitened(root: Array, jacobian: Array) -> Array:
@@ -286,10 +245,9 @@ class _Problem:
         return (factors * jacobian.reshape(*jacobian.shape[:-2], 1, -1)).reshape(len(jacobian), -1, factors.shape[-1])
 
     def in_std(self, jacobian: Array, residual: Array) -> tuple[Array, Array]:
-        """Derivatives (B, N G A, M) by the free parameters and residual (B, N G A, 1), in standard deviations."""
+        """Derivatives (B, N G A, M) by the parameters and residual (B, N G A, 1), in standard deviations."""
         columns = self._whitened(self.root, jacobian)
-        whitened = (residual @ self.root[:, :, 0].mT).reshape(*columns.shape[:2], 1)
-        return columns if self.to_all is None else columns @ self.to_all, whitened
+        return columns, (residual @ self.root[:, :, 0].mT).reshape(*columns.shape[:2], 1)
 
     def evaluate(self, values: Array) -> _Estimate:
         """Residual and normal equations at the parameters ``values`` (B, 2, P)."""
@@ -301,8 +259,8 @@ class _Problem:
         return _Estimate(values, jacobian, residual, np.square(whitened).sum((1, 2)), columns.mT @ columns, right)
 
     def moved(self, values: Array, step: Array) -> Array:
-        """Parameters after a step (B, M) of the free ones; frequencies stay positive."""
-        values = values + (step if self.to_all is None else step @ self.to_all.T).reshape(values.shape)
+        """Parameters (B, 2, P) after a step (B, M); frequencies stay positive."""
+        values = values + step.reshape(values.shape)
         return np.where(self.is_frequency, np.abs(values), values)
 
     def is_lone_and_resolved(self, values: Array) -> Array:
@@ -370,11 +328,16 @@ def _step(state: _Estimate, free: Array, damping: Array) -> Array:
     return scaled * scale
 
 
+def _problem(measurements: Measurements, start: Array | ToneFit, active: Array, drift_order: int) -> _Problem:
+    """The problem of a fit from frequencies, or from an earlier fit, whose order of the image motion remains."""
+    return _Problem(measurements, active, start.drift_order if isinstance(start, ToneFit) else drift_order)
+
+
 def fit_roughly(
-    measurements: Measurements, start: Array | ToneFit, active: Array, model: MotionModel, iterations: int = 5
+    measurements: Measurements, start: Array | ToneFit, active: Array, drift_order: int = 1, iterations: int = 5
 ) -> tuple[ToneFit, Array]:
     """A few steps of ``fit_tones``, without its covariance, and the residual displacements (B, N, G, 2)."""
-    problem = _Problem(measurements, active, model)
+    problem = _problem(measurements, start, active, drift_order)
     state = problem.solve(start, iterations, tolerance=1e-4)
     return problem.fit(state.values, state.matrix), state.residual
 
@@ -383,25 +346,25 @@ def fit_tones(
     measurements: Measurements,
     start: Array | ToneFit,
     active: Array,
-    model: MotionModel | None = None,
+    drift_order: int = 1,
     iterations: int = 30,
 ) -> ToneFit:
     """Fit all tones of both axes and the image motion by weighted least squares (Levenberg-Marquardt).
 
-    ``start`` are frequencies (B, 2, K) in Hz, or an earlier fit of the same tones; with harmonics, K is a multiple of
-    their number, each family with its fundamental first. Tones that are not ``active`` (B, 2, K) stay at zero.
+    ``start`` are frequencies (B, 2, K) in Hz, with the ``drift_order`` of the image motion, or an earlier fit of the
+    same tones, whose order remains. Tones that are not ``active`` (B, 2, K) stay at zero.
 
     The variance of the errors of each axis is that of its residuals: with ``S = diag(s_x, s_y)`` the errors of a row
     have the covariance ``S W^-1 S`` instead of the ``W^-1`` of the fit. With roll and zoom, all axes have one variance.
     """
-    problem = _Problem(measurements, active, model or MotionModel())
+    problem = _problem(measurements, start, active, drift_order)
     state = problem.solve(start, iterations, tolerance=1e-7)
     return problem.fit(state.values, problem.covariance(state, np.sqrt(problem.variances(state))))
 
 
 def fitted_again(measurements: Measurements, fit: ToneFit) -> ToneFit:
     """``fit_tones`` from an earlier fit, and that fit itself for stacks where it diverges."""
-    exact = fit_tones(measurements, fit, fit.active, fit.model)
+    exact = fit_tones(measurements, fit, fit.active)
     return select_stacks(is_bounded(exact, measurements.exposure_time), exact, fit)
 
 
@@ -411,7 +374,7 @@ def with_errors_of_blocks(measurements: Measurements, fit: ToneFit) -> ToneFit:
     Aliasing and fixed patterns depend on the scene, so that more frames do not average them out: in eight frames with
     little text, the amplitude was wrong by 6 standard deviations without this step, and by 3 with it.
     """
-    problem = _Problem(measurements, fit.active, fit.model)
+    problem = _Problem(measurements, fit.active, fit.drift_order)
     fit = fit.about(measurements.centre)
     of_blocks = problem.covariance_of_blocks(problem.evaluate(fit.parameters))
     # along the amplitude and the phase of each tone
@@ -433,7 +396,7 @@ def with_unknown_errors(measurements: Measurements, fit: ToneFit) -> ToneFit:
 
     Such a fit is exact for any errors, and its residual contains nothing of them.
     """
-    problem = _Problem(measurements, fit.active, fit.model)
+    problem = _Problem(measurements, fit.active, fit.drift_order)
     unknown = problem.num_spare <= 0.0
     if not bool(unknown.any()):
         return fit
@@ -537,11 +500,10 @@ def tone_displacements(fit: ToneFit, exposure_starts: Array, exposure_time: floa
     return (jacobian[..., :count] * tones.reshape(len(tones), 1, -1, count)).sum(-1)
 
 
-def free_jacobian(measurements: Measurements, fit: ToneFit) -> tuple[Array, Array]:
-    """Derivatives (B, N, G, A, M) of displacements by the free parameters of an axis, and the matrix (P, M) to all."""
-    problem, to_all = _Problem(measurements, fit.active, fit.model), _constraints(fit.model, fit.active.shape[-1], 1)
-    free = split_axis(problem.free, 1, problem.axes, -1)[:, None, None]
-    return (problem.jacobian(fit.parameters) @ to_all) * free, to_all
+def free_jacobian(measurements: Measurements, fit: ToneFit) -> Array:
+    """Derivatives (B, N, G, A, P) of the displacements of each axis by its parameters; 0 where no tone is."""
+    problem = _Problem(measurements, fit.active, fit.drift_order)
+    return problem.jacobian(fit.parameters) * split_axis(problem.free, 1, problem.axes, -1)[:, None, None]
 
 
 def amplitude_std(fit: ToneFit) -> Array:
@@ -566,14 +528,11 @@ def shrunk(fit: ToneFit, intervals: Array) -> ToneFit:
 
 
 def strongest_only(fit: ToneFit) -> ToneFit:
-    """The fit with only the strongest tone (or family) of each axis."""
-    harmonics = fit.model.harmonics
-    family = split_axis(fit.amplitude, -1, -1, harmonics).sum(-1).argmax(-1)[..., None, None]
-
-    def pick(values: Array) -> Array:
-        return np.take_along_axis(split_axis(values, -1, -1, harmonics), family, 2)[:, :, 0]
-
-    return replace(fit, coefficients=pick(fit.coefficients), frequencies=pick(fit.frequencies), active=pick(fit.active))
+    """The fit with only the strongest tone of each axis."""
+    strongest = fit.amplitude.argmax(-1)[..., None]
+    names = ("coefficients", "frequencies", "active")
+    picked: Table = {name: np.take_along_axis(getattr(fit, name), strongest, -1) for name in names}
+    return replace(fit, **picked)
 
 
 def with_tones(fit: ToneFit, count: int) -> ToneFit:

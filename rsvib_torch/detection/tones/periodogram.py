@@ -80,13 +80,10 @@ def explained_power(
     return decrease / determinant + np.square(drift_value) / drift_drift
 
 
-def strongest_frequencies(
-    measurements: Measurements, sample_interval: float, harmonics: int, count: int, weights: Array
-) -> Array:
+def strongest_frequencies(measurements: Measurements, sample_interval: float, count: int, weights: Array) -> Array:
     """Frequencies (B, S, 2, count) in Hz of the highest peaks of the periodogram of residuals, highest first.
 
-    Measurements are ``sample_interval`` seconds apart; the powers of ``harmonics`` multiples are added up; the search
-    is made with each of S ``weights`` (B, S, N, 2).
+    Measurements are ``sample_interval`` seconds apart; the search is made with each of S ``weights`` (B, S, N, 2).
     """
     # multiples of a step, from half a period up to the Nyquist limit of the samples
     step, window = 1.0 / (_OVERSAMPLING * (float(measurements.duration.max()) + sample_interval)), _OVERSAMPLING // 2
@@ -97,39 +94,25 @@ def strongest_frequencies(
     for part in runs(stacks, max(1, at_once // weightings)):
         some = take_stacks([measurements], np.arange(stacks)[part])
         for weighting in runs(weightings, at_once):
-            total = _of_families(_power(some, grid, weights[part, weighting]), grid[1], harmonics)
+            total = _power(some, grid, weights[part, weighting])
             # a peak is the maximum within half of 1 / duration on either side
             peak = total >= ndimage.maximum_filter1d(total, 2 * window + 1, mode="nearest")
             places[part, weighting] = np.where(peak, -total, 1.0).argsort(-1, stable=True)[..., :count]
     return grid[0] * (places + grid[1])
 
 
-def _of_families(total: Array, first: int, harmonics: int) -> Array:
-    """Power (..., F) of frequencies with that of their multiples; of nearly equal ones, the highest frequency wins."""
-    if harmonics == 1:
-        return total
-    place = np.arange(total.shape[-1]) + first
-    family = total.copy()
-    for harmonic in range(2, harmonics + 1):
-        index = harmonic * place - first
-        inside = index < total.shape[-1]
-        family[..., inside] += total[..., index[inside]]
-    nearly_best = family >= 0.95 * family.max(-1, keepdims=True)
-    return family * np.where(nearly_best, 1 + place / place[-1], 1.0)
-
-
 # --- Choice among the peaks ---
 
 
 def visibility(measurements: Measurements, frequencies: Array) -> Array:
-    """(B, 2) from 0 at blind frequencies (B, 2, H) of the record to 1 where the gain is large.
+    """(B, 2) from 0 at blind frequencies (B, 2) of the record to 1 where the gain is large.
 
     0 as well near multiples of 1 / T_e, where less than a tenth of the amplitude remains after the exposure: the
     residuals of long exposures, whose blur differs between frames, would be fitted by huge tones there.
     """
-    response = tone_response(measurements, frequencies)
-    gain = 4 * np.square(np.abs(response)).mean((1, 2)).max(-1)
-    resolved = np.abs(np.sinc(frequencies * measurements.exposure_time)).max(-1) > 0.1
+    response = tone_response(measurements, frequencies[..., None])[..., 0]
+    gain = 4 * np.square(np.abs(response)).mean((1, 2))
+    resolved = np.abs(np.sinc(frequencies * measurements.exposure_time)) > 0.1
     return gain / (gain + MIN_GAIN**2) * resolved
 
 
@@ -156,11 +139,10 @@ def best_candidate(
 
     The peaks of the periodogram of the ``residual`` (B, N, G, 2) px of the fit ``before`` are fitted roughly, each with
     the tones of that fit. ``weighed`` are the measurements with its weights, ``active`` (B, 2, K) its tones and the
-    further one (or family). With ``leave_out``, fits without a stretch of the record, which may be covered by clouds or
-    objects that move by themselves, are tried as well.
+    further one. With ``leave_out``, fits without a stretch of the record, which may be covered by clouds or objects
+    that move by themselves, are tried as well.
     """
     # 1. The parts of the record that are searched: all rows, and the rows without a stretch.
-    model, harmonics = before.model, before.model.harmonics
     parts, weights, peaks = measurements, weighed.weights[:, None], 4  # outliers may raise a wrong peak
     if leave_out:
         kept = without_stretches(measurements)
@@ -168,24 +150,21 @@ def best_candidate(
         weights, peaks = np.concatenate([weights, kept[1:, :, None] * measurements.weights[:, None]], 1), 2
     # 2. The highest peaks of each part, for the two axes, each fitted roughly with the tones of the earlier fit.
     unexplained = replace(measurements, displacements=residual)
-    peaks_of_parts = strongest_frequencies(unexplained, sample_interval, harmonics, peaks, weights)  # (B, S, 2, C)
-    multiples = np.arange(1, harmonics + 1)
-    further = (peaks_of_parts[..., None] * multiples).swapaxes(2, 3)  # (B, S, C, 2, H)
-    further = further.reshape(-1, *further.shape[3:])
+    peaks_of_parts = strongest_frequencies(unexplained, sample_interval, peaks, weights)  # (B, S, 2, C)
+    further = peaks_of_parts.swapaxes(2, 3).reshape(-1, peaks_of_parts.shape[2], 1)  # (B S C, 2, 1)
     count = len(further) // len(peaks_of_parts)
-    earlier = np.repeat(before.frequencies[..., : active.shape[-1] - harmonics], count, 0)
+    earlier = np.repeat(before.frequencies[..., : active.shape[-1] - 1], count, 0)
     rough, residuals = fit_roughly(
         parts.thinned().repeated(peaks_of_parts.shape[-1]),
         np.concatenate([earlier, further], -1),
         np.repeat(active, count, 0),
-        model,
-        iterations=5,
+        before.drift_order,
     )
     # 3. For each axis the fit that explains most, of which 65 % of the rows count: outliers may be all others. A tone
     # that is nearly blind counts less.
     several = measurements.thinned().repeated(count)
     size = split_axis(without_nan(quantile(several.sizes(residuals), 0.65, 1), 0.0), 0, -1, count)
-    visible = split_axis(visibility(several, rough.frequencies[..., -harmonics:]), 0, -1, count)
+    visible = split_axis(visibility(several, rough.frequencies[..., -1]), 0, -1, count)
     best = ((size.max(1, keepdims=True) - size) * visible).argmax(1)  # (B, 2)
 
     def chosen(values: Array, axis: int) -> Array:
@@ -194,10 +173,9 @@ def best_candidate(
         return np.moveaxis(np.take_along_axis(tried, place, 1)[:, 0], 1, axis)
 
     best_tones = {name: chosen(getattr(rough, name), 1) for name in ("coefficients", "frequencies", "drift")}
-    centre = rough.centre[::count]
-    fit = ToneFit(**best_tones, active=active, covariance=rough.covariance[:0], centre=centre, model=model)
+    fit = ToneFit(**best_tones, active=active, covariance=rough.covariance[:0], centre=rough.centre[::count])
     residual = residual_of(measurements, fit)
     # 4. Without a stretch: steps towards the least absolute residuals of all rows.
     for _ in range(3 if leave_out else 0):
-        fit, residual = fit_roughly(measurements.for_least_absolute(residual), fit, active, model)
+        fit, residual = fit_roughly(measurements.for_least_absolute(residual), fit, active)
     return fit, residual

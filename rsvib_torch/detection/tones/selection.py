@@ -8,7 +8,6 @@ from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.tones.fit import (
     LARGEST,
     MIN_GAIN,
-    MotionModel,
     ToneFit,
     amplitude_std,
     fit_roughly,
@@ -17,7 +16,7 @@ from rsvib_torch.detection.tones.fit import (
     residual_of,
 )
 from rsvib_torch.detection.tones.periodogram import best_candidate, visibility
-from rsvib_torch.numerics.tables import Array, median, quantile, select_stacks, split_axis, take_stacks, without_nan
+from rsvib_torch.numerics.tables import Array, median, quantile, select_stacks, take_stacks, without_nan
 from rsvib_torch.options import MAX_TONES
 
 MIN_SIGNIFICANCE = 4.0  # amplitude over its standard deviation
@@ -29,7 +28,7 @@ def robust_fit(
     measurements: Measurements,
     frequencies: Array,
     active: Array,
-    model: MotionModel,
+    drift_order: int = 1,
     residual: Array | None = None,
     *,
     steps: int = 2,
@@ -42,13 +41,13 @@ def robust_fit(
     there is no fit of equal weights first, and with that of a fit with reduced weights one of the ``steps`` suffices.
     """
     if residual is None:
-        rough, residual = fit_roughly(measurements, frequencies, active, model)
+        rough, residual = fit_roughly(measurements, frequencies, active, drift_order)
         frequencies = rough.frequencies
     for _ in range(steps - 1):
-        rough, residual = fit_roughly(measurements.reweighted(residual), frequencies, active, model)
+        rough, residual = fit_roughly(measurements.reweighted(residual), frequencies, active, drift_order)
         frequencies = rough.frequencies
     weighted = measurements.reweighted(residual)
-    return fit_tones(weighted, frequencies, active, model, iterations), weighted
+    return fit_tones(weighted, frequencies, active, drift_order, iterations), weighted
 
 
 _ALIASES, _WRONG_SIZE = 2, 3.0  # frequencies on either side; standard deviations of a typical row
@@ -67,7 +66,7 @@ def with_best_aliases(
     """
     size = without_nan(median(measurements.sizes(residual_of(measurements, fit)), 1), 0.0)  # (B, A)
     wrong = (size > wrong_size) & fit.active[..., 0]
-    if fit.model.harmonics > 1 or not bool(wrong.any()):
+    if not bool(wrong.any()):
         return fit
     parameters = fit.parameters[0].size
     fit = replace(fit, covariance=np.zeros((len(size), parameters, parameters)))
@@ -82,7 +81,7 @@ def with_best_aliases(
         frequencies[:, axis, 0] = np.abs(
             (signs * fit.frequencies[index, axis] + steps / measurements.interval[index, None]).ravel()
         )
-        others, residual = fit_roughly(some, frequencies, fit.active[tried], fit.model)
+        others, residual = fit_roughly(some, frequencies, fit.active[tried], fit.drift_order)
         # 2. The best one, where it leaves little enough of the residual.
         sizes = without_nan(median(some.sizes(residual), 1), np.inf)[:, axis].reshape(len(index), -1)
         place, better = np.arange(len(size)), sizes.min(1) < most_left * size[index, axis]
@@ -101,7 +100,7 @@ def find_tones(
     measurements: Measurements,
     sample_interval: float,
     tones: int | None = None,
-    model: MotionModel | None = None,
+    drift_order: int = 1,
     least_gain: float = 0.2,
     start: ToneFit | None = None,
     blind: Array | None = None,
@@ -114,14 +113,16 @@ def find_tones(
 
     The strongest tone of the gain-aware periodogram is added and all parameters are fitted again, until ``tones`` are
     found, or until the next one is not significant: it must pass an F-test and explain ``least_gain`` of the residual.
-    Rows or bands are ``sample_interval`` seconds apart. ``tones`` are those of each axis (families, where harmonics are
-    tied), None to choose their number from the data; those of the fit ``start`` are accepted. ``blind`` (F,) in Hz are
-    the blind frequencies of the frames, to recognise side tones. A fit is good enough once nearly all residuals of an
-    axis are below the ``accuracy`` in px. ``stretches``: whether the search allows for stretches of outliers, if there
-    is no start; ``iterations`` as in ``fit_tones``.
+    Rows or bands are ``sample_interval`` seconds apart. ``tones`` are those of each axis, None to choose their number
+    from the data; those of the fit ``start`` are accepted. ``blind`` (F,) in Hz are the blind frequencies of the
+    frames, to recognise side tones. A fit is good enough once nearly all residuals of an axis are below the
+    ``accuracy`` in px. ``stretches``: whether the search allows for stretches of outliers, if there is no start;
+    ``drift_order`` and ``iterations`` as in ``fit_tones``.
     """
-    model, stretches = model or MotionModel(), stretches and start is None
-    search = _Search(measurements, sample_interval, tones, model, least_gain, start, accuracy, stretches, iterations)
+    stretches = stretches and start is None
+    search = _Search(
+        measurements, sample_interval, tones, drift_order, least_gain, start, accuracy, stretches, iterations
+    )
     while search.step():
         pass
     if blind is None or tones is not None:
@@ -136,7 +137,7 @@ class _Search:
     measurements: Measurements
     sample_interval: float
     tones: int | None
-    model: MotionModel
+    drift_order: int
     least_gain: float
     start: ToneFit | None
     accuracy: float
@@ -148,7 +149,7 @@ class _Search:
         stacks, axes = len(self.measurements.exposure_starts), self.measurements.displacements.shape[-1]
         # the tones that are accepted, the fit with them, and the measurements with its weights
         if start is None:
-            none = np.zeros((stacks, axes, self.model.harmonics), dtype=bool)
+            none = np.zeros((stacks, axes, 1), dtype=bool)
             self.accepted = none[..., :0]
             self.fit, self.weighted = self.refitted(none.astype(np.float64), none)
         else:
@@ -158,8 +159,7 @@ class _Search:
         self.open_axes: Array = np.ones((stacks, axes), dtype=bool)  # that may need a further tone
         if start is not None and self.accuracy:  # a tone of roll in bands of strips is found as one of x or y otherwise
             self.open_axes = ~np.any(start.active, -1)
-        number = 0 if self.tones is not None else self.accepted.shape[-1] // self.model.harmonics
-        self.remaining = MAX_TONES - number
+        self.remaining = MAX_TONES - (0 if self.tones is not None else self.accepted.shape[-1])
 
     def step(self) -> bool:
         """Add a tone to the axes that need it; False if no axis does, or none is significant."""
@@ -169,7 +169,7 @@ class _Search:
         # 1. The axes that need a further tone: those with fewer tones than requested, or with a large residual.
         first = self.accepted.shape[-1] == 0
         if self.tones is not None:  # roll and zoom may have fewer tones than x and y to start with
-            self.open_axes = self.accepted.sum(-1) < self.tones * self.model.harmonics
+            self.open_axes = self.accepted.sum(-1) < self.tones
         residual = residual_of(self.measurements, self.fit)
         if not first:
             self.open_axes = self.open_axes & self.is_inexact(residual)
@@ -199,14 +199,15 @@ class _Search:
         return True
 
     def with_one_more(self) -> Array:
-        """(B, 2, K) bool, the accepted tones and a further one (or family) of the axes that need it."""
-        return np.concatenate([self.accepted, np.repeat(self.open_axes[..., None], self.model.harmonics, -1)], -1)
+        """(B, 2, K) bool, the accepted tones and a further one of the axes that need it."""
+        return np.concatenate([self.accepted, self.open_axes[..., None]], -1)
 
     def refitted(
         self, frequencies: Array, active: Array, residual: Array | None = None
     ) -> tuple[ToneFit, Measurements]:
         """``robust_fit`` of all measurements."""
-        return robust_fit(self.measurements, frequencies, active, self.model, residual, iterations=self.iterations)
+        order, iterations = self.drift_order, self.iterations
+        return robust_fit(self.measurements, frequencies, active, order, residual, iterations=iterations)
 
     def candidate(self, residual: Array, active: Array, *, leave_out: bool = False) -> tuple[ToneFit, Array]:
         """``best_candidate``: a rough fit with a further tone, and its residual."""
@@ -230,8 +231,8 @@ class _Search:
         return select_stacks(better, other, fit), select_stacks(better, other_weighted, weighted)
 
     def is_visible(self, fit: ToneFit) -> Array:
-        """(B, 2) bool, whether the last tone (or family) of each axis is visible."""
-        return visibility(self.measurements, fit.frequencies[..., -self.model.harmonics :]) > 0.5
+        """(B, 2) bool, whether the last tone of each axis is visible."""
+        return visibility(self.measurements, fit.frequencies[..., -1]) > 0.5
 
     def is_inexact(self, residual: Array) -> Array:
         """(B, 2) bool, axes with residuals above the accuracy that is needed."""
@@ -241,9 +242,8 @@ class _Search:
     def decreases(self, weighted: Measurements, before: Array, after: Array, *, share: float = 1.0) -> Array:
         """(B, 2) bool, whether the residual decreases by a share of what is needed for a further tone."""
         first, second = weighted.square(before), weighted.square(after)
-        parameters, families = 2 * self.model.harmonics + 1, self.with_one_more().sum(-1) // self.model.harmonics
-        spare = self.measurements.num_measurements - parameters * families - 1
-        needed = np.maximum(F_THRESHOLD * parameters * second / np.maximum(spare, 1.0), self.least_gain * first)
+        spare = self.measurements.num_measurements - 3 * self.with_one_more().sum(-1) - 1
+        needed = np.maximum(F_THRESHOLD * 3 * second / np.maximum(spare, 1.0), self.least_gain * first)
         return first - second > share * needed
 
 
@@ -267,7 +267,7 @@ def _with_blind_tones(measurements: Measurements, weighted: Measurements, fit: T
     a blind frequency f_b then appears as weak tones at f_b + f_m and |f_b - f_m|. The tone itself, which the verdict
     recognises as blind, is the simpler explanation.
     """
-    if fit.model.harmonics > 1 or len(blind) == 0:
+    if len(blind) == 0:
         return fit
     # 1. Weak tones near the side frequencies of a blind frequency and a large tone along the scan.
     size = fit.amplitude
@@ -295,7 +295,7 @@ def _with_blind_tones(measurements: Measurements, weighted: Measurements, fit: T
 
     # 3. The tone of this frequency instead of its side tones, kept where it explains no less per parameter.
     frequencies, active = replaced(suspected)
-    other = fit_tones(weighted, frequencies, active, fit.model)
+    other = fit_tones(weighted, frequencies, active, fit.drift_order)
     before = weighted.square(residual_of(measurements, fit))
     after = weighted.square(residual_of(measurements, other))
     spare = measurements.num_measurements - 3 * fit.active.sum(-1)
@@ -306,7 +306,7 @@ def _with_blind_tones(measurements: Measurements, weighted: Measurements, fit: T
     if not bool(better.any()):
         return fit
     frequencies, active = replaced(better)
-    return robust_fit(measurements, frequencies, active, fit.model)[0]
+    return robust_fit(measurements, frequencies, active, fit.drift_order)[0]
 
 
 def too_small(fit: ToneFit, intervals: Array, exposure_time: float) -> Array:
@@ -323,32 +323,28 @@ def significant_only(measurements: Measurements, fit: ToneFit, intervals: Array)
     A tone is significant if its amplitude is, or if the fit without it fails the F-test: the amplitudes of two tones
     that the record hardly resolves are uncertain, although both are needed. Tones of large gain whose offsets are below
     ``MIN_OFFSET`` may be residuals of interpolation and blur. Where the gain is small, small offsets do not mean a
-    small amplitude, and the tone stays for the verdict. A family of harmonics is kept or dropped as a whole.
+    small amplitude, and the tone stays for the verdict.
     """
-    harmonics = fit.model.harmonics
     needed = np.zeros_like(fit.active)
     while True:
-        # 1. The weakest tone (or family) of each axis that is neither significant nor needed.
+        # 1. The weakest tone of each axis that is neither significant nor needed.
         size, std = fit.amplitude, amplitude_std(fit)
         small = too_small(fit, intervals, measurements.exposure_time)
         kept = ((size > MIN_SIGNIFICANCE * std) & ~small) | (size == size.max(-1, keepdims=True)) | needed
-        kept = split_axis(kept & fit.active, -1, -1, harmonics).any(-1)
-        families = split_axis(fit.active, -1, -1, harmonics).any(-1)
-        ratio = split_axis(size / np.maximum(std, 1e-300), -1, -1, harmonics).max(-1)
-        least = np.where(families & ~kept, ratio, np.inf)
-        dropped = (least == least.min(-1, keepdims=True)) & families & ~kept
+        weak = fit.active & ~kept
+        ratio = np.where(weak, size / np.maximum(std, 1e-300), np.inf)
+        dropped = (ratio == ratio.min(-1, keepdims=True)) & weak
         if not bool(dropped.any()):
             return fit
-        dropped = np.repeat(dropped, harmonics, -1) & fit.active
         # 2. The fit without it. It is needed if the residual then increases significantly.
-        other = fit_tones(measurements, fit, fit.active & ~dropped, fit.model)
+        other = fit_tones(measurements, fit, fit.active & ~dropped)
         after = measurements.square(residual_of(measurements, fit))
         before = measurements.square(residual_of(measurements, other))
         spare = measurements.num_measurements - 3 * fit.active.sum(-1)
-        worse = before - after > F_THRESHOLD * 3 * harmonics * after / np.maximum(spare, 1.0)
+        worse = before - after > F_THRESHOLD * 3 * after / np.maximum(spare, 1.0)
         keep = dropped & worse[..., None] & ~small
         needed = needed | keep
         if bool(keep.any()):
-            fit = fit_tones(measurements, fit.frequencies, fit.active & ~dropped | keep, fit.model)
+            fit = fit_tones(measurements, fit.frequencies, fit.active & ~dropped | keep, fit.drift_order)
         else:
             fit = other

@@ -102,15 +102,12 @@ class LinearisedFit:
 
     axes: list[int]  # the A axes of the problem
     root: Array  # (B, N, A, A) from px to standard deviations
-    jacobian: Array  # X (B, D, A M), D = N G A
-    inverse: Array  # X^+ (B, A M, D)
+    jacobian: Array  # X (B, D, A P), D = N G A
+    inverse: Array  # X^+ (B, A P, D)
     residual: Array  # (B, D) of the fit
-    to_all: Array  # (P, M), from the free parameters of an axis to all
 
     @classmethod
-    def of_axes(
-        cls, measurements: Measurements, axes: list[int], jacobian: Array, residual: Array, to_all: Array
-    ) -> "LinearisedFit":
+    def of_axes(cls, measurements: Measurements, axes: list[int], jacobian: Array, residual: Array) -> "LinearisedFit":
         """The problem of one axis, or of all, from the ``free_jacobian`` and the residual (B, N, G, A') of a fit."""
         jacobian, residual = jacobian[..., axes, :], residual[..., axes]
         spent = (np.square(jacobian).max((1, 2)) > 0).sum((1, 2))
@@ -120,16 +117,16 @@ class LinearisedFit:
         whitened = (root[:, :, None] @ residual[..., None]).reshape(len(residual), -1)
         deviation = np.sqrt(np.maximum(np.square(whitened).sum(1) / spare, 1e-300))[:, None, None, None]
         root = root / deviation
-        X = root[:, :, None, :, :, None] * jacobian[..., None, :, :]  # (B, N, G, A, A, M)
+        X = root[:, :, None, :, :, None] * jacobian[..., None, :, :]  # (B, N, G, A, A, P)
         X = X.reshape(*whitened.shape, -1)
-        return cls(axes, root, X, pseudo_inverse(X), whitened / deviation[:, :, 0, 0], to_all)
+        return cls(axes, root, X, pseudo_inverse(X), whitened / deviation[:, :, 0, 0])
 
     def rounding(self, axis: int) -> Array:
         """(B,) error of the squared norm of whitened responses of about 1 px, for displacements without noise."""
         return 1e-12 * np.square(self.root[..., self.axes.index(axis)]).sum((1, 2))
 
     def unexplained(self, response: Array, axis: int) -> tuple[Array, Array]:
-        """Whitened part (B, D, Q) of a response that the parameters do not explain, and their change (B, A M, Q) by it.
+        """Whitened part (B, D, Q) of a response that the parameters do not explain, and their change (B, A P, Q) by it.
 
         The response (B, N, G, Q) consists of displacements of an axis in px by unit effects.
         """
@@ -140,28 +137,22 @@ class LinearisedFit:
         return Z - self.jacobian @ change, change
 
     def add_covariance(self, total: Array, added: Array) -> None:
-        """Add a covariance (B, A M, A M) of the free parameters to that of all of a fit (B, A' P, A' P), in place."""
-        count = len(self.axes)
-        blocks = split_axis(split_axis(added, -1, count, -1), 1, count, -1)
-        # from the free parameters m, n of axes i, j to all parameters p, q of these axes
-        blocks = np.einsum("pm,bimjn,qn->bipjq", self.to_all, blocks, self.to_all, optimize=True)
-        size = len(self.to_all)
-        of_parameters = total.reshape(len(total), total.shape[-1] // size, size, -1, size)
-        for row, first in enumerate(self.axes):
-            for column, second in enumerate(self.axes):
-                of_parameters[:, first, :, second] += blocks[:, row, :, column]
+        """Add a covariance (B, A P, A P) of the parameters of these axes to that (B, A' P, A' P) of a fit, in place."""
+        size = added.shape[-1]  # of one axis, or of all
+        part = slice(self.axes[0] * size, (self.axes[0] + 1) * size)
+        total[:, part, part] += added
 
     def add_change(self, total: Array, change: Array) -> None:
-        """Add a change (B, A M) of the free parameters to that of all of a fit (B, A', P), in place."""
-        total[:, self.axes] += split_axis(change, -1, len(self.axes), -1) @ self.to_all.T
+        """Add a change (B, A P) of the parameters of these axes to that (B, A', P) of a fit, in place."""
+        total[:, self.axes] += split_axis(change, -1, len(self.axes), -1)
 
 
 def linearised(measurements: Measurements, fit: ToneFit) -> list[tuple[int, LinearisedFit]]:
     """Each axis of a fit with the problem that contains it."""
-    (jacobian, to_all), residual = free_jacobian(measurements, fit), residual_of(measurements, fit)
+    jacobian, residual = free_jacobian(measurements, fit), residual_of(measurements, fit)
     axes = range(fit.coefficients.shape[1])
     parts = [[axis] for axis in axes] if len(axes) == 2 else [list(axes)]
-    problems = [LinearisedFit.of_axes(measurements, part, jacobian, residual, to_all) for part in parts]
+    problems = [LinearisedFit.of_axes(measurements, part, jacobian, residual) for part in parts]
     return [(axis, problem) for problem in problems for axis in problem.axes]
 
 
@@ -283,14 +274,11 @@ def with_unknown_image_motion(stated: "StatedFit", interval: float, exposure_tim
 
     They are not part of the displacement of rows, whose errors are those without image motion.
     """
-    fit, drifts = stated.fit, stated.fit.drift.shape[-1]
-    if drifts == 0:
-        return stated
-    axes = fit.amplitude.shape[1]
+    fit, axes = stated.fit, stated.fit.amplitude.shape[1]
     error = np.array(_DRIFT_BY_BLUR)[:axes] * np.square(_path_within(fit, exposure_time)).sum(-1) / interval  # px/s
     covariance = fit.covariance.copy()
     parameters = covariance.shape[-1] // axes
-    velocity = np.arange(axes) * parameters + parameters - drifts
+    velocity = np.arange(axes) * parameters + parameters - fit.drift_order
     covariance[:, velocity, velocity] += np.square(error)
     return replace(stated, fit=replace(fit, covariance=covariance))
 
@@ -362,13 +350,13 @@ def _added(
     slow_error: Array,
     number_is_known: bool,
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Covariance (B, A M, A M) of the free parameters and variance (B, A) of the displacement, by tones of an axis.
+    """Covariance (B, A P, A P) of the parameters and variance (B, A) of the displacement, by tones of an axis.
 
     By slow errors only, of (B,) px, and with a further tone. ``rows`` (B, n) are exposure starts in s, ``jacobian`` (B,
     n, A', P) the derivatives of their displacements by the parameters of each axis.
     """
     axes = problem.axes
-    of_displacement = _without_trend(jacobian[:, :, axes] @ problem.to_all, rows)
+    of_displacement = _without_trend(jacobian[:, :, axes], rows)
     of_tone = np.eye(len(axes))[axes.index(axis)][:, None, None]
     # 1. Prior of the quadratures: their precision, and the least precision that rounding leaves.
     size = _PRIOR_SIZE * np.sqrt(np.square(fit.amplitude[:, axis]).sum(-1))  # (B,) px
@@ -388,13 +376,13 @@ def _added(
         C = np.linalg.inv(information + limit * eye)
         v = (C @ right[..., None])[..., 0]
         evidence = 0.5 * (right * v).sum(-1) - 0.5 * np.linalg.slogdet(eye + information / precision)[1]
-        # 3. Displacement S of the rows by unit tones, and by the change of the parameters m that they cause: mean
+        # 3. Displacement S of the rows by unit tones, and by the change of the parameters p that they cause: mean
         # product over the rows n for each frequency f and axis a.
         time = rows + 0.5 * measurements.exposure_time - fit.centre[:, None]
         waves = unit_wave(2 * math.pi * chunk[:, None] * time[..., None])
         attenuation = np.sinc(chunk * measurements.exposure_time)[:, None]
         S = _without_trend(_quadratures(attenuation * waves), rows)
-        changes = split_axis(back, 1, len(axes), -1)  # (B, A, M, F, 2)
+        changes = split_axis(back, 1, len(axes), -1)  # (B, A, P, F, 2)
         S = S[:, :, None] * of_tone - np.einsum("bnam,bamfq->bnafq", of_displacement, changes, optimize=True)
         moved = np.einsum("bnafp,bnafq->bfapq", S, S) / S.shape[1]
         parts.append((evidence, C + v[..., :, None] * v[..., None, :], np.moveaxis(back, 1, 2), moved))
