@@ -71,9 +71,9 @@ class _OutputOptions:
 
 
 def _number_or_word(words: Sequence[str], text: str) -> object:
-    """Value of an option that is a number or one of some words."""
-    if text in words:
-        return _NONE if text == "none" else text
+    """Value of an option that is a number or one of some words, which are the same in capitals."""
+    if text.lower() in words:
+        return _NONE if text.lower() == "none" else text.lower()
     try:
         return float(text)
     except ValueError as error:

@@ -5,42 +5,31 @@ its own ``summary`` with the functions below.
 """
 
 import html
+import io
 import itertools
 import math
 import os
+import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
-from dataclasses import fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, get_args, get_origin
 
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks.arguments import check_fields, check_shapes, checked_methods
-from rsvib_torch.checks.values import check_number, described, needed_package, read_json
+from rsvib_torch.checks.arguments import check_fields, check_shapes, checked_methods, hints_of
+from rsvib_torch.checks.values import check_number, described, members_of, needed_package, read_json
 from rsvib_torch.files.atomic import write_json
 from rsvib_torch.files.reading import Table
 from rsvib_torch.results import IMPORTERS
-from rsvib_torch.results.reason import Findings, texts
-from rsvib_torch.text import AXES, data_uri, text_table, wrapped
+from rsvib_torch.results.reason import Findings, read_findings, texts
+from rsvib_torch.text import AXES, data_uri, quoted, text_table, wrapped
 
 if TYPE_CHECKING:
     import pandas
     from matplotlib.figure import Figure
-import io
-import types
-from dataclasses import MISSING
-from typing import TYPE_CHECKING, TypeVar, get_args, get_origin
-
-from rsvib_torch.checks.arguments import hints_of
-from rsvib_torch.checks.values import members_of
-from rsvib_torch.results.reason import read_findings
-from rsvib_torch.text import quoted
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 
 R = TypeVar("R")
 
