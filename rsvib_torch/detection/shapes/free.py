@@ -505,7 +505,7 @@ def vibration_in_place_of(motion: FreeMotion, first: float, last: float) -> Vibr
 def _nearly_blind(motion: FreeMotion, times: Tensor, timing: SensorTiming) -> list[bool]:
     """Whether the largest part of each axis is near a multiple of the frame rate, which hides motions.
 
-    Multiples are the same at frames with unequal intervals only by chance.
+    Frames at unequal intervals have no frequencies in common that they do not show, except by chance.
     """
     if timing.frame_start_times is not None:
         return [False] * motion.num_axes
