@@ -72,10 +72,12 @@ def part_reader(reader: FrameReader, start: int, end: int | None) -> FrameReader
             f"{info.path}: frames {start}:{'' if end is None else end} of a stack of {count} frames; expected "
             f"START:END with START < END <= {count}"
         )
+    numbers = None if info.frame_numbers is None else info.frame_numbers[start:last]
     part = replace(
         info,
         shape=(last - start, *info.shape[1:]),
         frame_times=None if info.frame_times is None else info.frame_times[start:last],
+        frame_numbers=None if numbers is None else tuple(number - numbers[0] for number in numbers),
         files=None if info.files is None else info.files[start:last],
         path=None,  # the sound of a video is not that of a part
     )

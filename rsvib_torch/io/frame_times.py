@@ -94,13 +94,16 @@ def _same_rate(spacing: _Spacing, info: StackInfo, timing: SensorTiming) -> bool
 def exposure_times(info: StackInfo, timing: SensorTiming) -> tuple[float, ...] | None:
     """Exposure start of every frame according to its file, in seconds; None if it is not stated, or at another rate.
 
-    Exact times are returned as they are. Times with an error, e.g. the presentation times of a video, are used
+    If a file without times states that frames are missing, the result consists of multiples of the sensor's frame
+    period. Exact times are returned as they are. Times with an error, e.g. the presentation times of a video, are used
     only if their interval is the frame period of the sensor to 1 %, or their intervals include it. If they are whole
     numbers of intervals apart to within their error or 2 % of a period, or a quarter of one with independent
     deviations, the result consists of multiples of the sensor's frame period, with gaps where frames were dropped.
     Otherwise the frame rate is variable: the times are
     returned as they are if their error is less than a tenth of a period.
     """
+    if info.frame_times is None and info.frame_numbers is not None:
+        return tuple(number * timing.frame_period for number in info.frame_numbers)
     if info.frame_times is None or info.time_error == 0.0:
         return info.frame_times
     spacing = _spacing(info)
@@ -163,23 +166,25 @@ def timing_from_first_frame(timing: SensorTiming, info: StackInfo) -> SensorTimi
 
 def describe_stack(info: StackInfo, timing: SensorTiming | None) -> list[str]:
     """Sentences about an orientation, dropped frames and unequal intervals that a file states."""
-    name, source, notes = info.path or "the file", f"its {info.time_source}", list[str]()
+    name, notes, missing, source = info.path or "the file", [], 0, f"its {info.time_source}"
     if info.orientation in _ORIENTATIONS:
         displayed = _ORIENTATIONS[info.orientation]
         notes.append(f"{name}: displayed {displayed}; rows, x and y are those of the stored frames")
     if timing is None or timing.frame_start_times is not None:
         return notes
     times, spacing = exposure_times(info, timing), _spacing(info)
-    if times is None or spacing is None:
-        return notes
-    if spacing.numbers is None:
+    if info.frame_times is None and info.frame_numbers is not None:
+        missing, source = info.frame_numbers[-1] + 1 - info.shape[0], "the numbers in the file names"
+    elif times is not None and spacing is not None and spacing.numbers is None:
         low, high = (1e3 * interval for interval in spacing.limits)
         error = f"whose error is up to {1e3 * info.time_error:.2g} ms; --frame-rate selects equal intervals"
         notes.append(f"{name}: frame intervals of {low:.4g} to {high:.4g} ms; {source} are used, {error}")
-    elif spacing.numbers and (missing := round(spacing.numbers[-1]) + 1 - len(times)):
+    elif times is not None and spacing is not None and spacing.numbers is not None:
+        missing = round(float(spacing.numbers[-1])) + 1 - len(times)
+    if missing:
         are = "frame is" if missing == 1 else "frames are"
         notes.append(f"{name}: {missing} {are} missing according to {source}, which are used")
-    if spacing.jitter > max(info.time_error, 0.02 * spacing.interval):
+    if times is not None and spacing is not None and spacing.jitter > max(info.time_error, 0.02 * spacing.interval):
         scatter = f"{source} scatter by up to {1e3 * spacing.jitter:.2g} ms like those of a program that records"
         notes.append(f"{name}: {scatter}; equal intervals are used, set frame_start_times if they are not")
     return notes

@@ -122,6 +122,26 @@ def _frame_files(path: Path) -> list[Path]:
     return sorted(next(iter(found.values())), key=parts)
 
 
+def _frame_numbers(files: list[Path]) -> tuple[int, ...] | None:
+    """Number of frame intervals from the first file to each one, if the numbers in the names show that some are gone.
+
+    Names must differ in one number, whose most common step is its smallest, and divides all steps: frame_0, frame_1,
+    frame_3. Other names, e.g. with times in ms (frame_0, frame_33, frame_67), state nothing.
+    """
+    names = [re.split(r"(\d+)", file.stem) for file in files]
+    if len(files) < 3 or any(len(name) != len(names[0]) or name[::2] != names[0][::2] for name in names):
+        return None
+    numbers = np.array([[int(part) for part in name[1::2]] for name in names], dtype=object)
+    varying = [column for column in numbers.T if len(set(column)) > 1]
+    if len(varying) != 1:
+        return None
+    steps = np.diff(varying[0])
+    step = min(steps)
+    if step < 1 or np.median(steps.astype(float)) != step or any(steps % step) or all(steps == step):
+        return None
+    return tuple(int(number - varying[0][0]) // step for number in varying[0])
+
+
 def open_images(path: Path) -> FrameReader:
     """Open the files of a folder, or one file; frames are decoded on access."""
     files = _frame_files(path)
@@ -157,7 +177,7 @@ def open_images(path: Path) -> FrameReader:
         with closing(_open_image(files[index])) as reader:
             return reader.frame(0)
 
-    return FrameReader(path, stack, read)
+    return FrameReader(path, replace(stack, frame_numbers=_frame_numbers(files)), read)
 
 
 def _ending(info: StackInfo) -> str:

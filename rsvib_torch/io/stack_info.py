@@ -56,6 +56,8 @@ class StackInfo(Summarised):
             and EXIF, e.g. 6 for 90 degrees clockwise. Frames always have the stored rows and columns.
         time_error: Largest error of ``frame_times`` in seconds, e.g. rounding in a video; 0 if they are exact exposure
             starts. Times with an error may run at another rate than the exposures (``exposure_times``).
+        frame_numbers: Number of frame intervals from the first frame to each frame, if frames of a recording are
+            missing and the file states this instead of the times.
         path: The file; None if the stack is not in a file, or has another number of frames than the file.
         metadata: Further metadata of a TIFF file by name, which are kept when it is restored to TIFF; None for those
             that cannot be kept.
@@ -82,6 +84,7 @@ class StackInfo(Summarised):
     orientation: int = 1
     time_error: float = field(default=0.0, compare=False)
     path: Path | None = field(default=None, compare=False)
+    frame_numbers: tuple[int, ...] | None = field(default=None, compare=False)
     metadata: Mapping[str, Tag | None] = field(default_factory=dict, compare=False, repr=False)
     decoding_bytes: int = field(default=0, compare=False)
     camera: str | None = field(default=None, compare=False)
@@ -147,7 +150,9 @@ class StackInfo(Summarised):
         if shape[-2:] != self.shape[-2:]:
             metadata = {name: None if tag is None or tag.scope == "image" else tag for name, tag in metadata.items()}
         if shape[0] != self.shape[0]:
-            return replace(self, shape=shape, metadata=metadata, frame_times=None, path=None, files=None)
+            return replace(
+                self, shape=shape, metadata=metadata, frame_times=None, frame_numbers=None, path=None, files=None
+            )
         return replace(self, shape=shape, metadata=metadata)
 
     def with_frames(self, count: int) -> "StackInfo":

@@ -3,12 +3,14 @@
 import re
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from small_stack import TIMING
 
 import rsvib_torch as rsv
 from rsvib_torch import StackInfo
+from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io import describe_stack, exposure_times, timing_from_first_frame
 
 KEPT = [0, 1, 2, 4, 5, 9, 10]  # the other frames were dropped
@@ -112,3 +114,31 @@ def test_exact_times_may_be_those_of_every_nth_frame():
     with pytest.warns(rsv.TimingWarning, match=r"128\.21 frames per second .* the times of the file are used"):
         used = timing_from_first_frame(TIMING, info_with(0.75 * TIMING.frame_period * np.arange(9), 0.0))
     assert used.frame_start_times[1] == pytest.approx(0.75 * TIMING.frame_period)
+
+
+@pytest.mark.parametrize(
+    ("names", "numbers"),
+    [
+        (("f_0", "f_1", "f_3", "f_4"), (0, 1, 3, 4)),
+        (("f_8", "f_10", "f_12", "f_20"), (0, 1, 2, 6)),  # every second frame was kept
+        (("f_98", "f_99", "f_100", "f_101"), None),
+        (("f_0", "f_33", "f_67", "f_100"), None),  # ms
+        (("2024-05-01_10-00-00", "2024-05-01_10-00-01", "2024-05-02_09-00-00"), None),
+    ],
+)
+def test_missing_numbers_in_file_names_are_missing_frames(tmp_path, names, numbers):
+    for name in names:
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.zeros((8, 8), np.uint8))
+    info = rsv.read_stack_info(tmp_path)
+    timing = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=100)
+    starts = rsv.timing_from_first_frame(timing, info).frame_start_times
+    notes = describe_stack(info, timing)
+    if numbers is None:
+        assert starts is None
+        assert notes == []
+    else:
+        assert starts == pytest.approx([0.01 * number for number in numbers])
+        missing = numbers[-1] + 1 - len(numbers)
+        stated = "1 frame is missing" if missing == 1 else f"{missing} frames are missing"
+        assert f"{stated} according to the numbers in the file names" in notes[0]
+        assert prepare_frames(tmp_path, timing).image_timing.frame_start_times == starts
