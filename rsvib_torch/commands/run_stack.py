@@ -119,6 +119,7 @@ def run(given: RunOptions) -> Answer:
 
 
 def _is_newer(table: Path, manifest: Path) -> bool:
+    """Whether a table exists and was written after the manifest, so that both are of the same run."""
     return table.exists() and table.stat().st_mtime_ns >= manifest.stat().st_mtime_ns
 
 

@@ -205,12 +205,8 @@ class RestorationCommand(StackCommand):
 
     def _chosen(self) -> Table:
         """Options of ``restore``: those of the configuration file, replaced by those of the command line."""
-        options, given, info, full_scale = (
-            dict(self.settings.restoration),
-            dict(self.restoration),
-            self.info,
-            self.scale,
-        )
+        options, given = dict(self.settings.restoration), dict(self.restoration)
+        info, full_scale = self.info, self.scale
         method: str = (options | given).get("method", "exact")
         if method != options.get("method", "exact"):  # other options belong to the configured method
             kept = ("saturation", *method_options(method))

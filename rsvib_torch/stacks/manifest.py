@@ -167,9 +167,10 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
         is_still = codes == {"no_tone"}
         vibration = self._tone_lines() if self.gyroscope is None else _gyroscope_lines(self.gyroscope)
         if is_still:
-            text = ": the camera stands still, or moves uniformly or by less than the noise"
-            # a hand may move the camera of a video, which is measured without tones
-            vibration.append(wrapped("no window has a significant tone" + text * ("video" not in self.settings)))
+            text = "no window has a significant tone"
+            if "video" not in self.settings:  # a hand may move the camera of a video, which is measured without tones
+                text += ": the camera stands still, or moves uniformly or by less than the noise"
+            vibration.append(wrapped(text))
         elif "video" in self.settings:
             vibration += self._lines_of_video()
         restoration = [f"{data['restored']} of {number_of(data['windows'], 'window')} restored"]
@@ -205,7 +206,10 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
             }
             for text in _first_of({window: why for window, why in against.items() if why}):
                 of_text.setdefault(text, []).append(name)
-        lines = [f"{' and '.join(names)} restored as measured, but not reliable in {t}" for t, names in of_text.items()]
+        lines = [
+            f"{' and '.join(names)} restored as measured, but not reliable in {windows}"
+            for windows, names in of_text.items()
+        ]
         assumed = [str(one) for found in self._tones if found is not None for one in found.assumptions]
         return [wrapped(line) for line in (*lines, *(f"assumed: {one}" for one in assumed[:1]))]
 

@@ -414,7 +414,7 @@ class _FirstPass:
         self.faults: dict[int, str] = {}  # number of each frame that cannot be used, with the reason
         self.corners: dict[int, Corners] = {}  # between a frame and the next one, of the first frames of each part
         self.compared: dict[int, Corners] = {}  # with a gyroscope, likewise, of some frames of the video
-        self.repetitions: dict[int, Array | None] = {}  # of each part, ``repetition`` of its first usable frame
+        self.repetitions: dict[int, Array | None] = {}  # without a gyroscope, of each part
         self._chosen = compared_pairs(len(times)) if video.rates is not None else []
         self._others: set[int] = set()  # frames that show something else than the frame before
         self._before: tuple[int, NDArray[np.uint8]] | None = None  # the usable frame before, and its number
@@ -463,7 +463,7 @@ class _FirstPass:
         if grey.min() == grey.max():
             self.faults[index] = f"frame {index} is constant"
             return ()
-        if index // PART_FRAMES not in self.repetitions:
+        if self._video.rates is None and index // PART_FRAMES not in self.repetitions:
             self.repetitions[index // PART_FRAMES] = repetition(grey)
         corners = self._follower.next(grey, self._video.starts[index])
         self._before = index, grey
