@@ -7,7 +7,9 @@ import math
 from collections.abc import Sequence
 from typing import get_args
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
@@ -103,16 +105,26 @@ def cut_columns(values: Tensor, parts: list[slice]) -> Tensor:
     return torch.stack([stack[..., part] for stack, part in zip(values, parts, strict=True)])
 
 
-def cut_parts(images: Tensor, tops: Sequence[int], lefts: Sequence[int], size: tuple[int, int]) -> Tensor:
-    """Parts (B, ..., h, w) of one size of images (B, ..., H, W), from row ``tops[b]`` and column ``lefts[b]`` on.
+def cut_parts(
+    images: Tensor,
+    members: Sequence[NDArray[np.int64]],
+    tops: NDArray[np.int64],
+    lefts: NDArray[np.int64],
+    size: tuple[int, int],
+) -> Tensor:
+    """Parts (N, ..., h, w) of one size of some ``members`` (N,) of images, from row ``tops`` and column ``lefts`` on.
 
     Example:
-        >>> cut_parts(torch.arange(12).view(2, 2, 3), [0, 1], [0, 2], (1, 1)).flatten().tolist()
+        >>> images = torch.arange(12).view(2, 2, 3)
+        >>> cut_parts(images, [np.array([0, 1])], np.array([0, 1]), np.array([0, 2]), (1, 1)).flatten().tolist()
         [0, 11]
     """
-    height, width = size
-    places = zip(images, tops, lefts, strict=True)
-    return torch.stack([image[..., top : top + height, left : left + width] for image, top, left in places])
+    # one strided view of each part, which takes a tenth of the time of an index
+    strides, lead = images.stride(), len(members)
+    steps = (*strides[:lead], *strides[-2:])
+    firsts: list[int] = (np.stack([*members, tops, lefts], 1) @ np.array(steps)).tolist()
+    shape, start = (*images.shape[lead:-2], *size), int(images.storage_offset())
+    return torch.stack([images.as_strided(shape, strides[lead:], start + first) for first in firsts])
 
 
 _LUMINANCE = (0.25, 0.5, 0.25)  # shares of red, green and blue in a mosaic

@@ -156,16 +156,18 @@ def form_rows(
 ) -> Tensor:
     """Form rows of frames from the spectra of the rows of a scene, which is mirrored beyond its first and last row.
 
-    The ``spectra`` (..., S, U) are those of B-spline coefficients, of ``degree`` across the rows. ``places`` (..., R,
-    N) are scene rows at the nodes of the exposures of R rows, and ``along`` (..., R, N) displacements along the rows in
-    px; ``node_weights`` (N,) sum to 1; frequencies (U,) are in cycles per px.
+    The ``spectra`` (..., 1, S, U) of one scene for all frames, or (..., T, S, U) of one for each of T frames, are those
+    of B-spline coefficients, of ``degree`` across the rows. ``places`` (T, R, N) are scene rows at the nodes of the
+    exposures of R rows, and ``along`` (T, R, N) displacements along the rows in px; ``node_weights`` (N,) sum to 1;
+    frequencies (U,) are in cycles per px. The rows are (..., T, R, U).
     """
     first, taps = row_taps(places, node_weights, partial(bspline_weights, degree=degree))
     source = first[..., None] + torch.arange(-(degree // 2), taps.shape[-2] - degree // 2, device=first.device)
-    source = mirrored(source, spectra.shape[-2])
+    scenes, rows = spectra.shape[-3:-1]
+    source = mirrored(source, rows) + rows * torch.arange(scenes, device=first.device)[:, None, None]
     transfer = row_transfer(taps, along, frequencies).to(spectra.dtype)
     # sum over the taps of each row
-    return (spectra[..., source, :] * transfer).sum(-2)
+    return (spectra.flatten(-3, -2)[..., source, :] * transfer).sum(-2)
 
 
 def _gather_index(psf: RowPSF, tap: int, scene_size: tuple[int, int]) -> Tensor:

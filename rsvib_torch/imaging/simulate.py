@@ -148,7 +148,7 @@ def _form_rows(scene: Tensor, starts: Tensor, timing: RowTiming, motion: Motion,
     num_rows = starts.shape[-1]
     top, left = (height - num_rows) // 2, (scene_width - width) // 2
     length = fast_length(scene_width + 2 * _MARGIN)
-    spectra = torch.fft.rfft(extend_rows(bspline_coefficients(scene, _DEGREE, -2), length, hold=0.0))
+    spectra = torch.fft.rfft(extend_rows(bspline_coefficients(scene, _DEGREE, -2), length, hold=0.0))[..., None, :, :]
     frequencies = torch.fft.rfftfreq(length, dtype=torch.float64, device=scene.device)
 
     formed = []

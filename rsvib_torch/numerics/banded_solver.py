@@ -92,6 +92,13 @@ class BandedFactor:
         """Values that define the factor."""
         return self.upper, self.inverse, self.middle, self.middle_inverse
 
+    def split(self, number: int) -> list["BandedFactor"]:
+        """Factors of ``number`` equal parts of the batch."""
+        ends = (values.unflatten(-1, (2, number, -1)) for values in (self.upper, self.inverse))
+        upper, inverse = ([part.flatten(-2) for part in values.unbind(-2)] for values in ends)
+        middle, middle_inverse = (values.chunk(number, -1) for values in (self.middle, self.middle_inverse))
+        return [BandedFactor(*parts) for parts in zip(upper, inverse, middle, middle_inverse, strict=True)]
+
     def log_determinant(self) -> Tensor:
         """Logarithms (S,) of the determinants of the matrices, float64."""
         ends, middle = (inverse.double().log().sum(0) for inverse in (self.inverse, self.middle_inverse))

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
@@ -20,14 +21,14 @@ from rsvib_torch.checks.values import check_whole_number
 from rsvib_torch.execution.parallel import at_once, runs
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.entry_points import load_frames
-from rsvib_torch.frames.pixels import detailed_parts
+from rsvib_torch.frames.pixels import cut_columns, cut_parts, detailed_parts
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames, reasons_from_row_order
 from rsvib_torch.imaging.blur import form_rows
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import ColumnMotion, Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.interpolation import correlated, extended_length, spline_spectra
-from rsvib_torch.numerics.tables import Array, table, tables, valid_mean
+from rsvib_torch.numerics.tables import Array, table, tables, take_stacks, valid_mean, without_nan
 from rsvib_torch.restoration.frame_motion import (
     FrameMotion,
     frame_motion,
@@ -172,31 +173,47 @@ def judge_stacks(
     Restored frames (B, T, C, H, W), or (B, 1, C, H, W), are in row order, verdicts in image axes. Only the ``columns``
     with the most detail are used.
     """
+    # 1. The pairs of frames of all stacks, and what they have in common.
     most = None if most_pairs is None else check_whole_number("most_pairs", most_pairs, at_least=1)
     pairs = pairs_to_judge(motion.shift.shape[1], joint, most)
     dtype = torch.promote_types(frames.images.dtype, restored.dtype)
     raw, still = (images.to(dtype) for images in frames.compared(restored))
+    given = _judged_strip(_JudgedFrames(raw, still, frames.missing, motion))
+    numbers = np.array([(stack, *pair) for stack in stacks for pair in pairs], np.int64).reshape(-1, 3)
+    detailed = None if columns is None else detailed_parts(given.images, columns)
+    common = _common_parts(given.motion, numbers, given.images.shape[-2:])
+
+    # 2. Pairs whose common parts have the same size are judged together, as many as the memory allows.
     shared = len(joint_groups(raw.shape[1], joint)[0][0])  # frames from which one image is restored
+    advance = steps(len(numbers), "pairs of frames")
+    judged: dict[int, _PairVerdict] = {}
+    sizes, group = np.unique(np.concatenate([common.size, common.rim], 1), axis=0, return_inverse=True)
+    for number, size in enumerate(sizes):
+        members = np.flatnonzero(common.is_enough & (group == number))
+        pair_bytes = 64 * raw.shape[2] * int(size[:2].prod())
+        for part in runs(len(members), at_once(pair_bytes, raw.device, cpu_bytes=2**26)):
+            some = members[part]
+            verdicts_of_pairs = _judge_pairs(given, take_stacks([common], some), shared, detailed)
+            judged |= zip(some.tolist(), verdicts_of_pairs, strict=True)
+            advance(len(some))
+
+    # 3. One verdict for all pairs of a stack, in image axes.
     verdicts: list[RestorationVerdict | TooLittleInCommonError] = []
-    advance = steps(len(stacks), "stacks")
-    for stack in stacks:
-        missing = None if frames.missing is None else frames.missing[stack]
-        moves = [bound > 0 for bound in motion.bounds[stack]]
-        advance()
-        given = _judged_strip(_Stack(raw[stack], still[stack], missing, motion.of([stack])))
-        try:
-            judged = [_judge_pair(_common_part(given, *pair, columns), moves, shared) for pair in pairs]
-        except TooLittleInCommonError as error:
-            verdicts.append(error)
+    for first in range(0, len(numbers), len(pairs)):
+        of_stack = range(first, first + len(pairs))
+        apart = [number for number in of_stack if number not in judged]
+        if apart:
+            (earlier, later), (down, right) = common.frames[apart[0]], common.step[apart[0]]
+            common_text = f"frames {earlier} and {later} have nothing in common, or too little: "
+            verdicts.append(TooLittleInCommonError(f"{common_text}they lie ({right}, {down}) px apart"))
             continue
-        # one result for all pairs, in image axes
-        levels, displacements, outcomes, reasons = zip(*judged, strict=True)
-        sizes = torch.from_numpy(np.stack(displacements, 1)).to(raw.device)  # (3, P, 2)
-        sizes = sizes.flip(-1) if frames.image_timing.scan_axis == -1 else sizes
-        of_levels = torch.tensor(levels, dtype=torch.float64, device=raw.device).unbind(-1)
+        levels, displacements, outcomes, reasons = zip(*(judged[number] for number in of_stack), strict=True)
+        moved = torch.from_numpy(np.stack(displacements, 1)).to(raw.device)  # (3, P, 2)
+        moved = moved.flip(-1) if frames.image_timing.scan_axis == -1 else moved
+        of_levels = torch.tensor(np.array(levels), dtype=torch.float64, device=raw.device).unbind(-1)
         verdict = RestorationVerdict(
             **dict(zip(LEVELS, of_levels, strict=True)),
-            **dict(zip(DISPLACEMENTS, sizes, strict=True)),
+            **dict(zip(DISPLACEMENTS, moved, strict=True)),
             outcome=outcomes,
             findings=tuple(reasons_from_row_order(of_pair, frames.image_timing) for of_pair in reasons),
         )
@@ -216,16 +233,16 @@ def pairs_to_judge(count: int, joint: bool | int, most: int | None = None) -> li
 
 
 @dataclass(frozen=True, eq=False)
-class _Stack:
-    """Raw frames of a stack in row order, and the frames restored from them."""
+class _JudgedFrames:
+    """Raw frames of B stacks in row order, and the frames restored from them."""
 
-    images: Tensor  # (T, C, H, W)
-    restored: Tensor  # likewise, or (1, C, H, W) in the coordinates of the earlier frame of each pair
-    missing: Tensor | None  # (T, C, H, W) bool, pixels without data
-    motion: FrameMotion  # a batch of one
+    images: Tensor  # (B, T, C, H, W)
+    restored: Tensor  # likewise, or (B, 1, C, H, W) in the coordinates of the earlier frame of each pair
+    missing: Tensor | None  # (B, T, C, H, W) bool, pixels without data
+    motion: FrameMotion
 
 
-def _judged_strip(given: _Stack) -> _Stack:
+def _judged_strip(given: _JudgedFrames) -> _JudgedFrames:
     """The part of the frames by which their restoration is judged.
 
     With roll or zoom, this is a strip of columns: of those in the middle of both halves, the one with more detail.
@@ -236,23 +253,61 @@ def _judged_strip(given: _Stack) -> _Stack:
         return given
     strip = min(_STRIP, width // 2)
     halves = [slice(middle - strip // 2, middle - strip // 2 + strip) for middle in (width // 4, width - width // 4)]
-    both = torch.cat([given.images[:1, ..., half] for half in halves], -1)
-    (detailed,) = detailed_parts(both[None], strip)
-    half = halves[0 if detailed.start < strip // 2 else 1]
-    column = torch.tensor([half.start + 0.5 * (strip - width)], dtype=torch.float64, device=both.device)
+    both = torch.cat([given.images[:, :1, ..., half] for half in halves], -1)
+    chosen = [halves[0 if detailed.start < strip // 2 else 1] for detailed in detailed_parts(both, strip)]
+    middles = [half.start + 0.5 * (strip - width) for half in chosen]
+    columns = torch.tensor(middles, dtype=torch.float64, device=both.device)
     starts = tuple(motion.frame_starts.tolist())
-    of_strip = ColumnMotion(motion.vibration, column, starts, motion.timing.row_time, height)
-    return _Stack(
-        given.images[..., half],
-        given.restored[..., half],
-        None if given.missing is None else given.missing[..., half],
-        frame_motion(of_strip, motion.timing, motion.frame_starts, height),
+    of_strips = ColumnMotion(motion.vibration, columns, starts, motion.timing.row_time, height)
+    return _JudgedFrames(
+        cut_columns(given.images, chosen),
+        cut_columns(given.restored, chosen),
+        None if given.missing is None else cut_columns(given.missing, chosen),
+        frame_motion(of_strips, motion.timing, motion.frame_starts, height),
     )
 
 
 @dataclass(frozen=True, eq=False)
-class FramePair:
-    """The common part of two raw frames and of their restored frames, (C, h, w) each."""
+class _CommonParts:
+    """What N pairs of frames have in common."""
+
+    stack: NDArray[np.int64]  # (N,)
+    frames: NDArray[np.int64]  # (N, 2) the earlier and the later one
+    moves: NDArray[np.bool_]  # (N, 2) whether the axis (x, y) moves in this stack
+    step: NDArray[np.int64]  # (N, 2) displacement (y, x) in whole px of the content from the earlier to the later frame
+    size: NDArray[np.int64]  # (N, 2) rows and columns of the part
+    rim: NDArray[np.int64]  # (N, 2) rows and columns at its ends that are not compared
+
+    @property
+    def is_enough(self) -> NDArray[np.bool_]:
+        """(N,) whether the compared part is larger than the filters."""
+        enough: NDArray[np.bool_] = (self.size - 2 * self.rim).min(1) >= 2 * _RIM + 3
+        return enough
+
+
+def _common_parts(motion: FrameMotion, pairs: NDArray[np.int64], shape: torch.Size) -> _CommonParts:
+    """Common parts of pairs (N, 3) of a stack, an earlier and a later frame of it, in frames of a shape."""
+    stack, frames, extent = pairs[:, 0], pairs[:, 1:], np.array(shape)
+    # rows are displaced by so much beyond the content of their frame, axes (y, x)
+    moved = _mean_places(motion)
+    shift, reach = (values[stack[:, None], frames][..., ::-1] for values in tables(motion.shift, moved.abs().amax(-2)))
+    step = (shift[:, 1] - shift[:, 0]).astype(np.int64)
+    # sizes change in steps, so that many pairs have the same
+    unit = np.clip(extent // 32, _MARGIN, 4 * _MARGIN)
+    rim = np.ceil((reach.max(1) + _MARGIN) / unit).astype(np.int64) * unit
+    size = extent + -abs(step) // unit * unit
+    return _CommonParts(stack, frames, np.array(motion.bounds)[stack, :2] > 0, step, size, rim)
+
+
+def _mean_places(motion: FrameMotion) -> Tensor:
+    """Mean displacement (B, T, R, 2) in px of every row during its exposure, beyond the shift of its frame."""
+    displacement, node_weights = motion.exposures
+    return (displacement * node_weights[:, None]).sum(-2) - motion.shift[:, :, None]
+
+
+@dataclass(frozen=True, eq=False)
+class FramePairs:
+    """The common parts of N pairs of raw frames and of their restored frames, (N, C, h, w) each."""
 
     earlier: Tensor  # raw
     later: Tensor  # raw
@@ -260,161 +315,181 @@ class FramePair:
     restored_later: Tensor | None  # restored from the later frame; None where there is one image
     predicted: Tensor  # the later raw frame, formed from ``restored``
     changed_later: Tensor  # change of the restored later frame by the motion of that frame
-    offset: Tensor  # (2,) px, root-mean-square displacement between the two frames by the motion, axes (x, y)
-    # (2, C, h, w) bool, pixels of the raw frames without data; they hold the values that the restored frames predict
+    # (N, 2, C, h, w) bool, pixels of the raw frames without data; they hold the values that the restored frames predict
     missing: Tensor | None
 
 
-def _common_part(given: _Stack, earlier: int, later: int, columns: int | None) -> FramePair:
-    """Cut two frames to their common part; rows are those of the later one.
+def _cut_pairs(given: _JudgedFrames, common: _CommonParts, detailed: list[slice] | None) -> FramePairs:
+    """Cut pairs of frames to their common parts, which have one size; rows are those of the later frame.
 
-    Of the columns, those with the most detail are kept; None for all.
+    Of the columns, the ``detailed`` ones of each stack are kept; None for all.
     """
-    # 1. The displacement (y, x) in whole px of the content from the earlier to the later frame, and the displacement of
-    # single rows beyond it, with a margin: so much at the ends of the common part is not compared.
-    motion = given.motion.of([0], [earlier, later])
-    displacement, node_weights = motion.exposures
-    moved = (displacement[0] * node_weights[:, None]).sum(-2) - motion.shift[0][:, None]  # (2, R, 2)
-    step, reach = table(torch.stack([motion.shift[0].diff(dim=0)[0], moved.abs().amax((0, 1))]).flip(-1))
-    (down, right), (rim_y, rim_x) = step.astype(int).tolist(), (np.ceil(reach).astype(int) + _MARGIN).tolist()
-    height, width = given.images.shape[-2] - abs(down), given.images.shape[-1] - abs(right)
-    if min(height - 2 * rim_y, width - 2 * rim_x) < 2 * _RIM + 3:  # smaller than the filters
-        raise TooLittleInCommonError(
-            f"frames {earlier} and {later} have nothing in common, or too little: they lie ({right}, {down}) px apart"
-        )
-    top, left, later_top, later_left = max(-down, 0), max(-right, 0), max(down, 0), max(right, 0)
-    if columns is not None:
-        second = given.images[later, :, later_top : later_top + height, later_left + rim_x : later_left + width - rim_x]
-        (detailed,) = detailed_parts(second[None, None], columns)
-        left, later_left = left + detailed.start, later_left + detailed.start
-        width = detailed.stop - detailed.start + 2 * rim_x
+    (height, width), (rim_y, rim_x) = common.size[0].tolist(), common.rim[0].tolist()
+    (earlier, later), single = common.frames.T, given.restored.shape[1] == 1
+    first, second = (-common.step).clip(0), common.step.clip(0)  # row and column of the part in both frames
 
-    def before(images: Tensor) -> Tensor:
-        return images[..., top : top + height, left : left + width]
+    def cut(images: Tensor, frame: NDArray[np.int64], place: NDArray[np.int64]) -> Tensor:
+        return cut_parts(images, (common.stack, frame), place[:, 0], place[:, 1], (height, width))
 
-    def after(images: Tensor) -> Tensor:
-        return images[..., later_top : later_top + height, later_left : later_left + width]
-
+    # 1. Columns with the most detail, which lie in the part.
+    if detailed is not None:
+        part_width, width = width, min(width, detailed[0].stop - detailed[0].start + 2 * rim_x)
+        starts = np.array([columns.start for columns in detailed])[common.stack] - rim_x
+        inside = np.clip(starts, second[:, 1], second[:, 1] + part_width - width) - second[:, 1]
+        first[:, 1] += inside
+        second[:, 1] += inside
     # 2. Both restored frames with the motion of the later frame.
-    single = len(given.restored) == 1
-    first, second = before(given.images[earlier]), after(given.images[later])
-    still = before(given.restored[0 if single else earlier])
-    still_later = still if single else after(given.restored[later])
-    predicted, formed_later = reblur(torch.stack([still, still_later]), motion, 1, later_top)
+    raw, raw_later = cut(given.images, earlier, first), cut(given.images, later, second)
+    still = cut(given.restored, np.zeros_like(earlier) if single else earlier, first)
+    still_later = still if single else cut(given.restored, later, second)
+    both = torch.stack([still, still_later], 1)
+    predicted, formed_later = reblur(both, given.motion, common.stack, later, second[:, 0]).unbind(1)
     # 3. Predicted values at missing pixels, and the part that is compared.
     inner = (..., slice(rim_y, height - rim_y), slice(rim_x, width - rim_x))
     missing = None
     if given.missing is not None:
-        missing = torch.stack([before(given.missing[earlier]), after(given.missing[later])])
-        first = torch.where(missing[0], reblur(still, motion, 0, top), first)
-        second = torch.where(missing[1], predicted, second)
+        missing = torch.stack([cut(given.missing, earlier, first), cut(given.missing, later, second)], 1)
+        of_earlier = reblur(still[:, None], given.motion, common.stack, earlier, first[:, 0])[:, 0]
+        raw = torch.where(missing[:, 0], of_earlier, raw)
+        raw_later = torch.where(missing[:, 1], predicted, raw_later)
         missing = missing[inner]
-    return FramePair(
-        first[inner],
-        second[inner],
+    return FramePairs(
+        raw[inner],
+        raw_later[inner],
         still[inner],
         None if single else still_later[inner],
         predicted[inner],
-        formed_later[inner] - still_later[inner],
-        moved.diff(dim=0)[0].square().mean(0).sqrt(),
+        (formed_later - still_later)[inner],
         missing,
     )
 
 
-def reblur(scene: Tensor, motion: FrameMotion, frame: int, first_row: int) -> Tensor:
-    """Form a frame of a stack from restored scenes (..., h, w) (Eq. 9), independently of the restoration method.
+def reblur(
+    scenes: Tensor,
+    motion: FrameMotion,
+    stack: NDArray[np.int64],
+    frame: NDArray[np.int64],
+    first_row: NDArray[np.int64],
+) -> Tensor:
+    """Form frames of stacks from restored scenes (N, ..., h, w) (Eq. 9), independently of the restoration method.
 
-    Scenes are in row order, in the coordinates in which the frame is restored, and their row 0 is ``first_row`` of the
-    frame; they may be a part of the rows and columns, and are mirrored beyond.
+    Scenes are in row order, in the coordinates in which the frame (N,) of the stack (N,) is restored, and their row 0
+    is ``first_row`` (N,) of that frame; they may be a part of the rows and columns, and are mirrored beyond.
     """
     # displacement of each row during its exposure
-    degree, (height, width) = 5, scene.shape[-2:]
-    rows = torch.arange(height, device=scene.device)
+    degree, (height, width) = 5, scenes.shape[-2:]
     displacement, node_weights = motion.exposures
-    along, across = (displacement[0, frame, first_row + rows] - motion.shift[0, frame]).unbind(-1)
-    place = rows[:, None] - across
+    members = displacement[stack[:, None], frame[:, None], first_row[:, None] + np.arange(height)]
+    along, across = (members - motion.shift[stack, frame][:, None, None]).unbind(-1)
+    place = torch.arange(height, device=scenes.device)[:, None] - across
     low, high = place.aminmax(dim=-1)
     reach, blur = torch.stack([along.abs().amax(), (high - low).amax()]).tolist()
-    # spectra of the spline coefficients, and a few rows of the frame at a time
+    # spectra of the spline coefficients (..., N, h, U), and a few rows of the frames at a time
     length = extended_length(width, math.ceil(reach))
-    u = torch.fft.rfftfreq(length, dtype=scene.dtype, device=scene.device)
-    spectra, along = spline_spectra(scene, degree, length), along.to(scene.dtype)
-    step = at_once(16 * (degree + 1 + math.ceil(blur)) * len(u), scene.device, cpu_bytes=2**25)
-    formed = [form_rows(spectra, place[part], along[part], node_weights, u, degree) for part in runs(height, step)]
-    return torch.fft.irfft(torch.cat(formed, dim=-2), n=length)[..., :width]
+    u = torch.fft.rfftfreq(length, dtype=scenes.dtype, device=scenes.device)
+    spectra, along = spline_spectra(scenes.movedim(0, -3), degree, length), along.to(scenes.dtype)
+    step = at_once(16 * (degree + 1 + math.ceil(blur)) * len(u) * len(scenes), scenes.device)
+    formed = [
+        form_rows(spectra, place[:, part], along[:, part], node_weights, u, degree) for part in runs(height, step)
+    ]
+    return torch.fft.irfft(torch.cat(formed, dim=-2), n=length)[..., :width].movedim(-3, 0)
 
 
-def _mean_square(difference: Tensor) -> Tensor:
-    return difference.square().mean(dtype=torch.float64)
+def _mean(values: Tensor) -> Tensor:
+    """Mean (N,) over the pixels of N pairs (N, C, h, w)."""
+    return values.mean((1, 2, 3), dtype=torch.float64)
 
 
-def _judge_pair(
-    pair: FramePair, moves: list[bool], shared: int
-) -> tuple[list[float], Array, Outcome, tuple[Reason, ...]]:
-    """Verdict on a pair in row order: ``LEVELS``, ``DISPLACEMENTS`` (3, 2), the outcome and its reasons.
+_PairVerdict = tuple[Array, Array, Outcome, tuple[Reason, ...]]  # ``LEVELS``, ``DISPLACEMENTS`` (3, 2), the rest
 
-    ``moves`` are the axes with motion, ``shared`` the frames from which one image is restored.
+
+def _judge_pairs(
+    given: _JudgedFrames, common: _CommonParts, shared: int, detailed: list[slice] | None
+) -> list[_PairVerdict]:
+    """Verdicts on pairs of frames in row order, whose common parts have one size.
+
+    ``shared`` are the frames from which one image is restored.
     """
     # 1. Noise of the raw frames; frames that differ in brightness are made equal.
-    raw = torch.stack([pair.earlier, pair.later])
-    noise = float(valid_mean(np.square(noise_deviation(raw, pair.missing)).ravel(), 0))
-    noise = max(0.0 if math.isnan(noise) else noise, _MIN_NOISE**2)
-    pair = equally_bright(pair, noise)
+    pairs = _cut_pairs(given, common, detailed)
+    raw = torch.stack([pairs.earlier, pairs.later], 1)
+    noise = valid_mean(np.square(noise_deviation(raw, pairs.missing)).reshape(len(raw), -1), 1)
+    noise = np.maximum(without_nan(noise, 0.0), _MIN_NOISE**2)
+    pairs = equally_bright(pairs, torch.as_tensor(noise, device=raw.device))
 
     # 2. Displacement between the raw frames, and between the later one and its prediction. An image restored from both
     # frames lies between them, so that its distance from either is the smaller.
-    widening = math.sqrt(2.0 * shared / (shared - 1.0)) if shared > 1 else 1.0
-    sizes, resolutions = misfit(torch.stack([pair.earlier, pair.predicted]), pair.later.expand(2, *pair.later.shape))
-    misfit_before, misfit_after = sizes[0], widening * sizes[1]
-    resolution = np.minimum(resolutions[0], widening * resolutions[1])
+    widening = np.array([1.0, math.sqrt(2.0 * shared / (shared - 1.0)) if shared > 1 else 1.0])[:, None, None]
+    both = torch.stack([pairs.earlier, pairs.predicted])
+    sizes, resolutions = (values * widening for values in misfit(both, pairs.later.expand_as(both)))
+    displacements = np.stack([*sizes, resolutions.min(0)], 1)  # (N, 3, 2)
 
     # 3. Means over the pixels, which are transferred together. The noise of two restored frames is independent and
     # vanishes in the product of the changes of the scene by the motion.
-    unknown = torch.full((), math.nan, dtype=torch.float64, device=raw.device)
+    later = pairs.restored if pairs.restored_later is None else pairs.restored_later
+    moved = _mean_places(given.motion)[common.stack[:, None], common.frames].diff(dim=1)[:, 0]  # (N, R, 2)
     means = [
-        _mean_square(pair.later - pair.earlier),
-        unknown if pair.restored_later is None else _mean_square(pair.restored_later - pair.restored),
-        _mean_square(pair.later - pair.predicted),
-        ((pair.predicted - pair.restored) * pair.changed_later).mean(dtype=torch.float64),
-        torch.zeros_like(unknown) if pair.missing is None else pair.missing.any(0).double().mean(),
-        *pair.offset,
+        _mean((pairs.later - pairs.earlier).square()),
+        _mean((later - pairs.restored).square()),
+        _mean((pairs.later - pairs.predicted).square()),
+        _mean((pairs.predicted - pairs.restored) * pairs.changed_later),
+        torch.zeros_like(moved[:, 0, 0]) if pairs.missing is None else _mean(pairs.missing.any(1).double()),
+        *moved.square().mean(1).sqrt().unbind(-1),
     ]
-    before, after, unexplained, change, missing, *offset = torch.stack(means).tolist()
+    before, after, unexplained, change, missing, *offset = table(torch.stack(means))
+    if pairs.restored_later is None:
+        after = np.full_like(after, math.nan)
 
     # 4. Error of the restored frames, from their difference and that of the later frame from its prediction, and of the
     # raw frames: the change of the scene by the motion, and noise.
-    error = max(unexplained - noise, 0.0)
-    error = float(np.fmax(error, 0.5 * after)) if shared == 1 else error + noise / shared
-    gain = 10.0 * math.log10((max(change, 0.0) + noise) / max(error, _MIN_NOISE**2))
+    error = (unexplained - noise).clip(0.0)
+    error = np.fmax(error, 0.5 * after) if shared == 1 else error + noise / shared
+    gain = 10.0 * np.log10((change.clip(0.0) + noise) / error.clip(_MIN_NOISE**2))
 
-    # 5. The outcome; a gain of the opposite sign is not stated.
-    axes = (misfit_before.tolist(), misfit_after.tolist(), resolution.tolist())
-    outcome, reasons = outcome_of_pair(*axes, moves, offset, gain, one_image=pair.restored_later is None)
-    contradicted = (outcome == "worse" and gain > 0) or (outcome in ("helps", "partly") and gain < 0)
-    if missing > _MAX_MISSING:
-        outcome, reasons = "unknown", (Reason("pixels_missing", None, missing, _MAX_MISSING),)
-    levels = [before**0.5, after**0.5, noise**0.5, unexplained / noise, math.nan if contradicted else gain]
-    return levels, np.stack([misfit_before, misfit_after, resolution]), outcome, reasons
+    # 5. The outcomes; a gain of the opposite sign is not stated.
+    verdicts: list[_PairVerdict] = []
+    levels = np.stack([np.sqrt(before), np.sqrt(after), np.sqrt(noise), unexplained / noise, gain], 1)
+    for n, (one, moves, between) in enumerate(zip(displacements, common.moves, np.stack(offset, 1), strict=True)):
+        single = pairs.restored_later is None
+        misfits_of_pair, after_of_pair, resolution = one.tolist()
+        outcome, reasons = outcome_of_pair(
+            misfits_of_pair,
+            after_of_pair,
+            resolution,
+            moves.tolist(),
+            between.tolist(),
+            float(gain[n]),
+            one_image=single,
+        )
+        if (outcome == "worse" and gain[n] > 0) or (outcome in ("helps", "partly") and gain[n] < 0):
+            levels[n, -1] = math.nan
+        if missing[n] > _MAX_MISSING:
+            outcome, reasons = "unknown", (Reason("pixels_missing", None, float(missing[n]), _MAX_MISSING),)
+        verdicts.append((levels[n], one, outcome, reasons))
+    return verdicts
 
 
-def equally_bright(pair: FramePair, noise: float) -> FramePair:
-    """The pair with the earlier frame, and the images made of it, at the brightness and contrast of the later one.
+def equally_bright(pairs: FramePairs, noise: Tensor) -> FramePairs:
+    """The pairs with the earlier frame, and the images made of it, at the brightness and contrast of the later one.
 
     Gain and offset are the regression of the later frame on the predicted one, from means over squares of 16 px, which
-    are large beside residual displacements. The ``noise`` power draws the gain towards 1.
+    are large beside residual displacements. The ``noise`` power (N,) draws the gain towards 1. Frames that contradict
+    each other keep their brightness.
     """
-    side = min(16, *pair.later.shape[-2:])
-    means = functional.avg_pool2d(torch.stack([pair.predicted, pair.later]), side).flatten(2).double()  # (2, C, n)
+    side = min(16, *pairs.later.shape[-2:])
+    both = torch.stack([pairs.predicted, pairs.later]).flatten(0, 1)
+    means = functional.avg_pool2d(both, side).flatten(2).double().unflatten(0, (2, -1))  # (2, N, C, n)
     mean, target = means.mean(-1).unbind()
     predicted, later = means - means.mean(-1, keepdim=True)
-    slope = ((predicted * later).mean() + noise) / (predicted.square().mean() + noise)
-    if not bool(slope > 0):
-        return pair  # frames that contradict each other keep their brightness
-    offset = (target - slope * mean).to(pair.later.dtype)[:, None, None]
-    gain = slope.to(pair.later.dtype)
-    adjusted = {name: torch.addcmul(offset, getattr(pair, name), gain) for name in ("earlier", "restored", "predicted")}
-    changed = gain * pair.changed_later if pair.restored_later is None else pair.changed_later
-    return replace(pair, **adjusted, changed_later=changed)
+    slope = ((predicted * later).mean((1, 2)) + noise) / (predicted.square().mean((1, 2)) + noise)
+    agrees = slope > 0
+    offset = torch.where(agrees[:, None], target - slope[:, None] * mean, 0.0).to(pairs.later.dtype)[..., None, None]
+    gain = torch.where(agrees, slope, 1.0).to(pairs.later.dtype)[:, None, None, None]
+    adjusted = {
+        name: torch.addcmul(offset, getattr(pairs, name), gain) for name in ("earlier", "restored", "predicted")
+    }
+    changed = gain * pairs.changed_later if pairs.restored_later is None else pairs.changed_later
+    return replace(pairs, **adjusted, changed_later=changed)
 
 
 def misfit(first: Tensor, second: Tensor) -> tuple[Array, Array]:

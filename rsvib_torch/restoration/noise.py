@@ -160,8 +160,10 @@ def noise_of_frame_pair(frames: Tensor, motion: FrameMotion, ignore: Tensor | No
     tops, lefts = firsts[..., 0] + ((size[0] - abs(steps[:, :1])) - num_rows) // 2, firsts[..., 1]
 
     def shared(values: Tensor) -> Tensor:
-        places = zip(members.T.tolist(), tops.T.tolist(), lefts.T.tolist(), strict=True)
-        parts = [cut_parts(values[stacks, frame], top, left, (num_rows, columns)) for frame, top, left in places]
+        places = zip(members.T, tops.T, lefts.T, strict=True)
+        parts = [
+            cut_parts(values, (np.array(stacks), frame), top, left, (num_rows, columns)) for frame, top, left in places
+        ]
         return torch.stack(parts, 1)
 
     images, ignored = shared(frames), None if ignore is None else shared(ignore)

@@ -6,6 +6,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -86,14 +87,20 @@ def _mixing(count: int, weights: Sequence[float], fold: Callable[[Array], Array]
     return matrix
 
 
-def autoregressive_prior(observed: Tensor, transfer: Tensor, aliases: Tensor, noise_power: Tensor) -> RowPrior:
+Values = TypeVar("Values", Array, Tensor)
+
+
+def autoregressive_prior(
+    observed: Values, transfer: Values, aliases: Values, noise_power: Values
+) -> tuple[Values, Values, Values, Values]:
     """Fit the prior to the power spectrum of blurred, noisy frames by expectation maximisation.
 
     Each step computes the expected power spectrum of the scene for the current model, the sum of the squared Wiener
     estimate and of its variance, and fits the autoregressive model to it (Yule-Walker equations). ``observed`` (N, U,
     V) is the power of the frames, ``transfer`` that of the blur, and ``noise_power`` that of the noise. ``aliases`` (N,
     T, U, V) is the power of the interpolation error of the kernel between rows, through the blur of each frame, for a
-    wave of power 1.
+    wave of power 1. The results are the power, both reflections and the interpolation power of ``RowPrior``. Arrays
+    take half of the time of tensors, through which gradients flow.
     """
     _, U, V = observed.shape
     matrices = (
@@ -104,7 +111,9 @@ def autoregressive_prior(observed: Tensor, transfer: Tensor, aliases: Tensor, no
         _mixing(U, (0.2,) * 5, lambda u: u.clip(0, U - 1)),
         _mixing(V, (0.2,) * 5, lambda v: v % V),
     )
-    cosine, pooling, around_u, around_v = (torch.from_numpy(matrix).to(observed.device) for matrix in matrices)
+    cosine, pooling, around_u, around_v = (
+        torch.from_numpy(matrix).to(observed) if isinstance(observed, Tensor) else matrix for matrix in matrices
+    )
     # steps are small where the noise is stronger than the scene: below half of the noise power, the initial value is
     # pooled over neighbouring frequencies, as that of a single one depends on chance
     excess, level = observed - noise_power, 0.5 * noise_power
@@ -128,7 +137,7 @@ def autoregressive_prior(observed: Tensor, transfer: Tensor, aliases: Tensor, no
         gain = 1.0 / (penalty + transfer)
         scene = gain * noise_power + gain * gain * through
     interpolation = (scene[:, None] * aliases).mean(-1)
-    return RowPrior(power, torch.stack([first, second]), interpolation.clip(_TINY, None))
+    return power, first, second, interpolation.clip(_TINY, None)
 
 
 def brightness(frames: Tensor) -> Tensor:
@@ -242,11 +251,14 @@ def fit_prior(frames: Tensor, motion: FrameMotion, levels: Tensor, length: int) 
     v = spectrum.v + torch.tensor([[0.0], [-1.0], [1.0]], dtype=spectrum.v.dtype, device=spectrum.v.device)
     blur, power = spectrum.blur(spectrum.u, v.flatten()).unflatten(-1, (3, -1)), kernel_spectrum(v).square()
     transfer = smeared(blur[..., 0, :] * power[0])
-    aliases = (blur[..., 1:, :].mean(2) * power[1:]).sum(-2)
+    aliases: Tensor = (blur[..., 1:, :].mean(2) * power[1:]).sum(-2)
     observed, weight, noise = spectrum.weighted(transfer)
     passed = (weight * transfer).sum((1, 2))
-    prior = autoregressive_prior(observed, passed, aliases, noise)
-    return prior.resampled(length // 2 + 1)
+    spectra = observed, passed, aliases, noise
+    differentiable = torch.is_grad_enabled() and (observed.requires_grad or passed.requires_grad)
+    fitted = autoregressive_prior(*spectra) if differentiable else autoregressive_prior(*tables(*spectra))
+    power, first, second, interpolation = (torch.as_tensor(values, device=frames.device) for values in fitted)
+    return RowPrior(power, torch.stack([first, second]), interpolation).resampled(length // 2 + 1)
 
 
 def smeared(transfer: Tensor) -> Tensor:
@@ -281,10 +293,10 @@ class SampledRows:
         # degrees of freedom n - d log det A / d log s: a difference quotient.
         products, step = torch.cat([*precisions], 2).repeat_interleave(slabs, 2), 1.2
         normal = observation.normal(len(products) - 1)
-        repeated = replace(normal, left=normal.left.repeat(1, 1, number, 1)).in_windows([slice(0, observation.count)])
-        factor, stronger = (
-            factor_banded(repeated.at(observation.u, times * products), observation.count) for times in (1.0, step)
-        )
+        left = normal.left.repeat(1, 1, 2 * number, 1)
+        both = replace(normal, left=left).in_windows([slice(0, observation.count)])
+        system = both.at(observation.u, torch.cat([products, step * products], 2))
+        factor, stronger = factor_banded(system, observation.count).split(2)
         growth = (stronger.log_determinant() - factor.log_determinant()).view(number, scenes, slabs, frequencies)
         freedom = observation.count * slabs - growth.sum(2) / math.log(step)
         # 2. The residuals of the rows with each prior, which are channels of the scenes that are fitted.
