@@ -16,7 +16,7 @@ from rsvib_torch.commands import answers
 from rsvib_torch.commands import shared_options as shared
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.terminal import Answer, current_output, note, warn, working
-from rsvib_torch.files.atomic import whole_folder
+from rsvib_torch.files.atomic import check_writable, whole_folder
 from rsvib_torch.files.reading import Table
 from rsvib_torch.options import FreeMotionOptions, MotionUnit, ProcessStackOptions
 
@@ -172,10 +172,8 @@ def restore(given: RestoreOptions) -> Answer:
     replaces = given.overwrite or "resume" in given.processing
     shared.check_new(outputs, replaces, [*given.inputs, vibration, given.motion, given.lens_profile])
     current_output().work = stacks.work_folder(given.restored)
+    check_writable(given.restored, folder=not given.restored.suffix)
     info, scale, chosen = given.info, given.scale, given.of_stack["restoration"]
-    shape = info.restored_as(chosen.get("scale", 1), chosen.get("mosaic")).shape
-    shape = (1, *shape[1:]) if chosen.get("joint") is True else shape
-    io.check_stack_target(given.restored, shape, dtype=info.dtype, full_scale=scale, like=info)
     of_run = given.of_stack | {"force": given.force} | given.processing
     # 1. The vibration of all frames, or the motion on the clock of the frames.
     if vibration is not None and given.motion is None:

@@ -12,7 +12,6 @@ from .stack_info import split_range as split_range
 from .stack_reading import open_stack as open_stack
 from .stack_reading import read_stack as read_stack
 from .stack_reading import read_stack_info as read_stack_info
-from .stack_writing import check_stack_target as check_stack_target
 from .stack_writing import metadata_not_kept as metadata_not_kept
 from .stack_writing import stack_files as stack_files
 from .stack_writing import write_stack as write_stack

@@ -17,14 +17,13 @@ import numpy as np
 import tifffile
 
 from rsvib_torch.files.reading import Table
-from rsvib_torch.io.frame_reader import FrameError, FrameReader, contiguous_reader, readable_stack
+from rsvib_torch.io.frame_reader import FrameError, FrameReader, check_held, contiguous_reader, readable_stack
 from rsvib_torch.io.full_scale import check_dtype
 from rsvib_torch.io.stack_info import Scope, StackInfo, Tag, attributes_of, fields_of_attributes
 from rsvib_torch.numerics.tables import Array
 
 _PHOTOMETRIC: tuple[int, ...] = (tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.RGB)
 _LOSSLESS = {1, 5, 8, 32946, 32773, 34925, 50000}  # none, LZW, Deflate (two codes), PackBits, LZMA, Zstandard
-_LARGEST_RATIO = 5000  # of pixels to the size of the file; deflate reaches 1032
 
 
 class _Page(NamedTuple):
@@ -153,9 +152,7 @@ def open_tiff(path: Path) -> FrameReader:
         if offset is not None:
             stored_dtype = dtype.newbyteorder(tif.byteorder)
             return contiguous_reader(path, info, offset, stored_dtype, channels_last=channels_last)
-        nbytes = info.shape[0] * info.frame_bytes
-        if nbytes > _LARGEST_RATIO * size:
-            raise ValueError(f"its header states {nbytes} bytes of pixels, which {size} bytes cannot hold")
+        check_held(info.shape[0] * info.frame_bytes, size)
         if sum(complete) < 0.5 * len(complete):
             raise ValueError(f"truncated: pixels of page {complete.index(False)} lie beyond the end of the file")
         over_pages = shape[: len(shape) - len(first.shape)]
