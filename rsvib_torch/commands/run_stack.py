@@ -14,7 +14,7 @@ from rsvib_torch.checks.values import options
 from rsvib_torch.commands import answers
 from rsvib_torch.commands.flat_command import Given, argument
 from rsvib_torch.commands.shared_options import PixelSizeOptions, RestorationCommand, VerdictOptions
-from rsvib_torch.commands.stack_commands import print_notes, read_frames
+from rsvib_torch.commands.stack_commands import print_notes
 from rsvib_torch.commands.terminal import Answer, current_output, warn, working
 from rsvib_torch.files.atomic import whole_folder
 from rsvib_torch.files.reading import Table
@@ -177,7 +177,7 @@ def _window_page(
     if not given.report:
         middle = 0 if first.indices else len(indices) // 2
         indices, after = indices[middle : middle + 1], after[:1]
-    before = read_frames(given.frames, indices, options["full_scale"]) if len(after) else after
+    before = io.read_frames(given.frames, indices, options["full_scale"]).nan_to_num(0.0) if len(after) else after
     if len(before) and options["restoration"].get("mosaic") is not None:
         before = preparation.colour_frames(before, options["restoration"]["mosaic"])
     restored = after if first.restored else None
@@ -199,11 +199,11 @@ def _video_page(given: RunOptions, restored: Path, stored: stacks.StackManifest)
     usable = (number for number in range(given.info.shape[0] - 1) if not {str(number), str(number + 1)} & bad.keys())
     first = min(usable, key=lambda number: abs(number - 8), default=None)  # earlier frames must be decoded as well
     indices = () if first is None else (first, first + 1)  # no two neighbours could be used
-    before, after = read_frames(given.frames, indices, stored.settings["full_scale"]), None
+    before, after = io.read_frames(given.frames, indices, stored.settings["full_scale"]), None
     if stored.margins is not None:
         before = video.Margins(**stored.margins).cut(before)
     if any(record.frames == "restored" for record in stored.windows):
-        after = read_frames(restored, indices, None)
+        after = io.read_frames(restored, indices)
     return _page(given, stored, frames=before, restored=after, first=first or 0, timing=given.settings.timing)
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -37,18 +35,6 @@ def load(given: shared.StackCommand) -> tuple[Tensor, rsvib_torch.SensorTiming]:
         frames = io.read_stack(given.frames, full_scale=given.scale)
     print_notes(given.info, given.settings)
     return frames.to(given.torch_device), io.timing_from_first_frame(given.settings.timing, given.info)
-
-
-def read_frames(path: Path, indices: Sequence[int], full_scale: float | None) -> Tensor:
-    """Frames of a stack, (T, H, W) or (T, C, H, W) with full scale 1 and 0 for missing pixels."""
-    import numpy as np  # noqa: PLC0415
-
-    with closing(io.open_stack(path)) as reader:
-        info = reader.info
-        pixels = np.empty((len(indices), *info.shape[1:]), info.dtype)
-        for place, index in enumerate(indices):
-            pixels[place] = reader.frame(index)
-    return io.counts_to_frames(pixels, full_scale or info.full_scale, str(path), info.nodata).nan_to_num(0.0)
 
 
 def print_notes(info: io.StackInfo, config: Config) -> None:
