@@ -73,16 +73,13 @@ def run(given: RunOptions) -> Answer:
     replaces = given.overwrite or "resume" in given.processing
     answers.check_folder(out, _RESULTS, replaces, given.inputs, out / output)
     current_output().work = stacks.work_folder(out / output)
-    info, common = given.info, given.of_stack
-    print_notes(info, settings)
-    chosen = WindowOptions(**{**settings.stack, **given.windows})
+    print_notes(given.info, settings)
+    window = WindowOptions(**{**settings.stack, **given.windows}).window
     # 1. Process windows, or a video of more than one window from frame to frame.
-    followed = bool(given.moved) or (given.video and io.is_video(frames) and info.shape[0] > chosen.window)
-    result = _process_video(given, out / output, common) if followed else _process(given, out / output, common, chosen)
-    stored = stacks.read_manifest(result.manifest)
-    first = None if followed else _first_window(given, result, common | _windows(given, chosen))
-    page = _video_page(given, out / output, stored) if first is None else _window_page(given, first, common, stored)
-    answers.note_lost(out / output, () if followed else result.not_kept)
+    followed = bool(given.moved) or (given.video and io.is_video(frames) and given.info.shape[0] > window)
+    result = _process_video(given, out / output) if followed else _process(given, out / output, window)
+    stored, first = stacks.read_manifest(result.manifest), result.first
+    page = _video_page(given, out / output, stored) if first is None else _window_page(given, first, stored)
     # 2. Figure, tables and page.
     with whole_folder(out) as folder:
         drawn = []
@@ -91,7 +88,7 @@ def run(given: RunOptions) -> Answer:
                 reports.save_figure(_comparison(page), folder / "before_after.png")
             drawn = ["before_after.png"]
         names = [output, *drawn, "manifest.json"] if followed else [*drawn, output, "manifest.json"]
-        answer = _describe(folder, given, result, page, None if first is None else first.restoration, stored, names)
+        answer = _describe(folder, given, result, page, stored, names)
         if given.report:
             pages = _write_page(folder, page, stored, answer)
             answers.check_folder(out, pages, overwrite=True, inputs=given.inputs)
@@ -123,39 +120,31 @@ def _name_of_output(given: RunOptions) -> str:
     return output
 
 
-def _windows(given: RunOptions, chosen: WindowOptions) -> Table:
-    """Options of a run in windows."""
-    return {"window": chosen.window, "force": given.force, "detection": given.settings.detection}
+def _process(given: RunOptions, restored: Path, window: int) -> stacks.StackReport:
+    """Process a stack in windows; the first one is computed again if it was complete before."""
+    options = given.of_stack | {"window": window, "force": given.force, "detection": given.settings.detection}
+    frames, timing, counts = given.frames, given.settings.timing, given.info.shape[0] > window
+    of_run = options | given.processing | {"manifest": given.out / "manifest.json"}
+    with working(f"restoring {frames.name}", counts=counts) as progress:
+        result = stacks.process_stack(frames, restored, timing, **of_run, progress=progress if counts else None)
+    if result.bad_frames:
+        warn(f"{number_of(result.bad_frames, 'frame')} could not be used: see manifest.json")
+    answers.note_lost(restored, result.not_kept)
+    if result.first is not None:
+        return result
+    options |= {name: value for name, value in given.processing.items() if name in ("memory", "workers")}
+    return replace(result, first=next(iter(stacks.iterate_stack(frames, timing, **options))))
 
 
-def _process(given: RunOptions, restored: Path, common: Table, chosen: WindowOptions) -> stacks.StackReport:
-    """Process a stack in windows."""
-    of_run = common | _windows(given, chosen) | given.processing | {"manifest": given.out / "manifest.json"}
-    counts = given.info.shape[0] > chosen.window
-    with working(f"restoring {given.frames.name}", counts=counts) as progress:
-        of_run["progress"] = progress if counts else None
-        return stacks.process_stack(given.frames, restored, given.settings.timing, **of_run)
-
-
-def _process_video(given: RunOptions, restored: Path, common: Table) -> stacks.StackReport:
+def _process_video(given: RunOptions, restored: Path) -> stacks.StackReport:
     """Process a video from frame to frame."""
-    restoration = dict(common["restoration"])
+    restoration = dict(given.of_stack["restoration"])
     if {**given.settings.restoration, **given.restoration}.get("saturation") in (None, "auto"):
         restoration.pop("saturation", None)  # that of integer formats
-    of_run = common | {"restoration": restoration} | given.moved | given.windows | given.processing
+    of_run = given.of_stack | {"restoration": restoration} | given.moved | given.windows | given.processing
     of_run["manifest"] = given.out / "manifest.json"
     with working(f"restoring {given.frames.name}", counts=True) as progress:
         return video.process_video(given.frames, restored, given.settings.timing, **of_run, progress=progress)
-
-
-def _first_window(given: RunOptions, result: stacks.StackReport, options: Table) -> stacks.WindowResult:
-    """The result of the first window, which is computed with these options if it was complete before."""
-    if result.bad_frames:
-        warn(f"{number_of(result.bad_frames, 'frame')} could not be used: see manifest.json")
-    if result.first is not None:
-        return result.first
-    resources = {name: value for name, value in given.processing.items() if name in ("memory", "workers")}
-    return next(iter(stacks.iterate_stack(given.frames, given.settings.timing, **options, **resources)))
 
 
 def _page(given: RunOptions, stored: stacks.StackManifest, **shown: Any) -> reports.Report:
@@ -168,18 +157,16 @@ def _page(given: RunOptions, stored: stacks.StackManifest, **shown: Any) -> repo
     )
 
 
-def _window_page(
-    given: RunOptions, first: stacks.WindowResult, options: Table, stored: stacks.StackManifest
-) -> reports.Report:
+def _window_page(given: RunOptions, first: stacks.WindowResult, stored: stacks.StackManifest) -> reports.Report:
     """The page of the first window: all of its frames, or without a page one of them: of a joint image, the middle."""
-    after = first.frames.cpu()
+    after, mosaic = first.frames.cpu(), given.of_stack["restoration"].get("mosaic")
     indices = first.indices or [index for index in first.window.written if index not in first.bad_frames]
     if not given.report:
         middle = 0 if first.indices else len(indices) // 2
         indices, after = indices[middle : middle + 1], after[:1]
-    before = io.read_frames(given.frames, indices, options["full_scale"]).nan_to_num(0.0) if len(after) else after
-    if len(before) and options["restoration"].get("mosaic") is not None:
-        before = preparation.colour_frames(before, options["restoration"]["mosaic"])
+    before = io.read_frames(given.frames, indices, given.scale).nan_to_num(0.0) if len(after) else after
+    if len(before) and mosaic is not None:
+        before = preparation.colour_frames(before, mosaic)
     restored = after if first.restored else None
     shown: Table = {"frames": before, "restored": restored, "first": next(iter(indices), 0)}
     if first.restoration is not None:
@@ -212,20 +199,21 @@ def _describe(
     given: RunOptions,
     result: stacks.StackReport,
     page: reports.Report,
-    judged: stacks.RestoredFrames | None,
     stored: stacks.StackManifest,
     names: list[str],
 ) -> Answer:
     """Write the tables and figures of one vibration of all frames, or of the windows; their names are added."""
-    frames, found = given.frames, page.detection
-    if page.windows is None and found is not None and judged is not None:
+    frames, found, title = given.frames, page.detection, f"Vibration in {given.frames.name}"
+    if page.windows is None and found is not None and result.first is not None and result.first.error is None:
         names += answers.write_detection(folder, found, page.timing, given.pixel_size)
-        answers.warn_of_restoration(judged)
-        answer = answers.stack_answer(frames, found, given.pixel_size, judged, given.info.shape[0])
+        answer = answers.stack_answer(frames, found, given.pixel_size)
+        answer.results["Restoration"], answer.data["restoration"] = answers.restoration_of(result)
         answer.next_steps = answers.steps_after_detection(found, frames, given.settings)
     else:
         names += answers.write_windows(folder, stored, given.pixel_size)
-        answer = answers.windows_answer(f"Vibration in {frames.name}", stored, result)
+        answer = Answer({title: stored.lines()[0]}, {"windows": stored.totals()})
+        answer.reliable = answers.verdicts([record.detection for record in stored.windows])
+        answer.results["Restoration"] = [result.summary(), *stored.lines()[1][1:]]
     if not given.video and io.is_video(frames) and result.restored < result.windows:
         answer.next_steps.insert(0, answers.run_step(frames, given.out / "followed", given.settings.arguments))
     return answer

@@ -179,7 +179,8 @@ def restore(given: RestoreOptions) -> Answer:
     with working(f"restoring {frames.name}", counts=counts) as progress:
         of_run["progress"] = progress if counts else None
         run = stacks.process_stack(frames, given.restored, settings.timing, **of_run)
-    answer.results["Restoration"], answer.data["restoration"] = answers.restoration_of(run, given.restored)
+    answers.note_lost(given.restored, run.not_kept)
+    answer.results["Restoration"], answer.data["restoration"] = answers.restoration_of(run)
     answer.files += [given.restored, given.manifest]
     return answer
 
