@@ -34,22 +34,6 @@ if TYPE_CHECKING:
 R = TypeVar("R")
 
 
-def result_of(kind: type[R], data: Table, path: Path) -> R:
-    """A result of a class from the content of a file that ``Result.save`` wrote, see ``Result.load``."""
-    file_format, found = getattr(kind, "file_format", ""), str(data.get("format"))
-    if found != file_format or data.get("version") != 1:
-        content = {"rsvib vibration": "DetectionResult", "rsvib stack": "StackManifest"}.get(found, found[6:])
-        reader = f", which {content}.load reads" if content[:1].isupper() and found != file_format else ""
-        raise ValueError(
-            f"{path}: expected format {file_format!r} of version 1, as {kind.__name__}.save writes it, got "
-            f"{quoted(found)} of version {quoted(data.get('version'))}{reader}"
-        )
-    try:
-        return decode(kind, data, "")
-    except (ValueError, RuntimeError, OverflowError) as error:  # of PyTorch and of conversions, for impossible values
-        raise ValueError(f"{path}: {str(error).partition(chr(10))[0]}") from error
-
-
 def _decoded(kind: object, value: object, path: str, missing: float) -> object:
     """A value of an annotated type from what ``plain_values`` made of it; ``missing``: what None is in a tensor."""
     kind = next(iter(members_of(kind)))
@@ -331,7 +315,15 @@ class Result(Summarised):
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
         """Read a file that ``save`` wrote."""
-        return result_of(cls, read_json(Path(path), f"file of {cls.__name__}.save"), Path(path))
+        data = read_json(Path(path), f"file of {cls.__name__}.save")
+        if (data.get("format"), data.get("version")) != (cls.file_format, 1):
+            got = f"{quoted(data.get('format'))} of version {quoted(data.get('version'))}"
+            expected = f"format {cls.file_format!r} of version 1, as {cls.__name__}.save writes it"
+            raise ValueError(f"{path}: expected {expected}, got {got}")
+        try:
+            return decode(cls, data, "")
+        except (ValueError, RuntimeError, OverflowError) as error:  # of PyTorch and of conversions of impossible values
+            raise ValueError(f"{path}: {str(error).partition(chr(10))[0]}") from error
 
     def table(self, *, pixel_size: float | None = None) -> dict[str, list[object]]:
         """The result as columns by name, with the unit in each name; None for unknown values.

@@ -209,4 +209,4 @@ def test_a_saved_detection_is_a_vibration_json(detection, windows, frames, tmp_p
     assert given.summary() == detection.summary()
     torch.testing.assert_close(rsv.restore(frames, TIMING, given), rsv.restore(frames, TIMING, detection))
     windows.save(path)
-    refuses(lambda: rsv.read_vibration(path), r"a batch of detections; read it with DetectionResult\.load")
+    refuses(lambda: rsv.read_vibration(path), r"is a batch of shape \(3,\): pass one of them")
