@@ -191,8 +191,12 @@ def _motion_of_frames(given: RestoreOptions, path: Path, info: StackInfo, answer
     ignore = stacks.mask_of_regions(given.ignore or (), (info.shape[-2], info.shape[-1]))
     print_notes(info, given.settings)
     if isinstance(recorded, rsvib_torch.FreeMotion) and given.offset is not None:
-        return _placed(given, recorded, timing, given.offset)
-    camera = _camera(given)
+        return recorded.retimed(given.offset)
+    camera = None
+    if given.lens_profile is not None:
+        camera = rsvib_torch.Camera.from_gyroflow(given.lens_profile, info.shape[-1], info.shape[-2])
+    elif given.unit is None and given.focal_length is not None:
+        camera = rsvib_torch.Camera(given.focal_length)
     with working("aligning the recording"):
         found = stacks.align_stack(given.frames, info, timing, recorded, camera=camera, ignore=ignore)
     answer.results["Recording on the clock of the frames"] = [found.summary()]
@@ -215,24 +219,3 @@ def _recorded(given: RestoreOptions, path: Path) -> rsvib_torch.FreeMotion | rsv
     if given.lens_profile is not None and given.focal_length is not None:
         raise ValueError("--lens-profile and --focal-length both state the focal length: give one of them")
     return rsvib_torch.read_gyroscope(path)
-
-
-def _camera(given: RestoreOptions) -> rsvib_torch.Camera | None:
-    """The stated lens of a gyroscope."""
-    if given.lens_profile is not None:
-        return rsvib_torch.Camera.from_gyroflow(given.lens_profile, given.info.shape[-1], given.info.shape[-2])
-    return None if given.unit is not None or given.focal_length is None else rsvib_torch.Camera(given.focal_length)
-
-
-def _placed(
-    given: RestoreOptions, recorded: rsvib_torch.FreeMotion, timing: rsvib_torch.SensorTiming, offset: float
-) -> rsvib_torch.FreeMotion:
-    """A recording whose clock is stated, if it covers the frames."""
-    info, placed = given.info, recorded.retimed(offset)
-    starts = io.timing_from_first_frame(timing, info).frame_starts(info.shape[0])
-    readout = info.shape[int(timing.scan_axis)] * timing.row_time + timing.exposure_time
-    last = float(starts[-1] - starts[0]) + readout
-    if placed.start > 1e-9 or placed.end < last - 1e-9:  # s; rounding of the offset
-        needed = f"the frames need {offset:.6g} to {offset + last:.6g} s"
-        raise ValueError(f"{given.motion}: covers {recorded.start:.6g} to {recorded.end:.6g} s, {needed}")
-    return placed

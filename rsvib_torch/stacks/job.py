@@ -287,6 +287,9 @@ def _given(
         raise ValueError("motion must be a FreeMotion; it has no detection and no given detections beside it")
     starts: list[float] = (timing.frame_starts(info.shape[0]) - timing.frame_starts(1)).tolist()
     readout = info.shape[int(timing.scan_axis)] * timing.row_time + timing.exposure_time
+    if motion.start > motion.spacing or motion.end < starts[-1] + readout - motion.spacing:
+        needed = f"the frames need 0 to {starts[-1] + readout:.6g} s"
+        raise ValueError(f"motion covers {motion.start:.6g} to {motion.end:.6g} s on the clock of the frames, {needed}")
     ends = [(starts[window.first], starts[window.last]) for window in windows]
     parts = [motion.within(first - readout, last + 2 * readout).retimed(first) for first, last in ends]
     return [part.to(options.device) for part in parts]
@@ -322,6 +325,9 @@ def plan_job(
     if job.chosen.mosaic is not None:
         check_mosaic(job.chosen.mosaic, info.shape, str(source))
     check_optics(job.chosen.optics)
+    joint, most = job.chosen.joint, min(stated.window, info.shape[0])
+    if joint is not True and joint > most:
+        raise ValueError(f"joint must be at most {most}, the number of frames in a window (window), got {joint}")
     if options.workers is not None:
         most = options.workers
     elif on_gpu:

@@ -49,7 +49,7 @@ def test_mistakes_of_a_value_name_its_sources(place, tmp_path, capsys):
         (("motion", "--config", "{}", "--out", "m.csv", "--knot-rows", 1), "--knot-rows must be at least 4"),
         (
             ("run", "r", "--config", "{}", "--method", "exact", "--joint", 4),
-            "--joint 4 exceeds the number of",
+            "--joint must be at most 3, the number of frames",
         ),
     ],
 )
