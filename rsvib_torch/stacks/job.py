@@ -72,11 +72,6 @@ class WindowResult(Summarised):
         """Whether the frames are restored."""
         return self.restoration is not None and self.restoration.restored
 
-    @property
-    def changed(self) -> dict[int, Tensor]:
-        """The restored frames by index."""
-        return dict(zip(self.indices, self.frames, strict=True)) if self.restored else {}
-
     def summary(self) -> str:
         """Frames of the window, its vibration, and what was restored."""
         state = "restored" if self.restored else "unchanged"
@@ -227,7 +222,8 @@ class StackJob:
         if result.restored and not result.indices:  # one image of all frames
             frames = list(counts(result.frames))
         else:
-            restored, written = result.changed, list(result.window.written)
+            restored = dict(zip(result.indices, result.frames, strict=True)) if result.restored else {}
+            written = list(result.window.written)
             written = [written[len(written) // 2]] if self.chosen.joint is True else written
             frames = [counts(restored[index]) if index in restored else as_taken(index) for index in written]
         return frames, self.record(result, len(frames))
