@@ -38,7 +38,7 @@ class RunOptions(RestorationCommand, PixelSizeOptions, VerdictOptions):
     output: str = "restored.tif"
     """Name of the restored stack in that folder; its extension selects the format, e.g. .mp4 or .mkv for a video with
     the time stamps and the sound of the input. restored/ is a folder with a file for each frame: from a folder of TIFF
-    files, TIFF files of the same names, georeference, tiles and compression."""
+    files, TIFF files of the same names and georeference."""
     video: bool = False
     """Write a video: restored.mp4 (H.264) from .mp4, restored.mov from .mov, else restored.mkv (FFV1, without loss).
     Videos are followed frame by frame instead of in windows."""

@@ -17,11 +17,10 @@ from PIL import ExifTags, Image
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile, putchunk
 
-from rsvib_torch.files.reading import Table
 from rsvib_torch.io.frame_reader import FrameError, FrameReader, check_held, readable_stack
 from rsvib_torch.io.full_scale import known_full_scale
 from rsvib_torch.io.stack_info import DIFFERENT, StackInfo, Tag, exif_fields
-from rsvib_torch.io.tiff import open_tiff, storage_of, write_tiff
+from rsvib_torch.io.tiff import open_tiff, write_tiff
 from rsvib_torch.numerics.tables import Array
 
 _PNG, _TIFF, _JPEG = (".png",), (".tif", ".tiff"), (".jpg", ".jpeg")
@@ -195,14 +194,13 @@ def _write_file(file: Path, info: StackInfo, frame: Array, source: Path | None =
     if file.suffix.lower() in _PNG:
         encode_png(file, np.asarray(frame, dtype=info.dtype), one)
         return
-    storage: Table = {}
     with suppress(ValueError):  # a damaged file, whose frame is written as one without data
         if source is not None:
             with closing(_open_image(source)) as reader:
-                like, storage = reader.info, storage_of(source)
+                like = reader.info
             times = None if like.time_error else like.frame_times
             one = replace(one, frame_times=times, metadata=like.with_shape(one.shape).metadata)
-    write_tiff(file, one, iter([frame]), None, storage)
+    write_tiff(file, one, iter([frame]), None)
 
 
 def write_images(path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None) -> None:
