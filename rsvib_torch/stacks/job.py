@@ -99,7 +99,6 @@ class StackJob:
     options: ProcessStackOptions
     # of every window, the motion to use instead of a detection, from its first frame on; None: it has none
     given: Sequence[DetectedVibration | FreeMotion | None] | None = None
-    is_recorded: bool = False  # whether ``given`` are parts of a recorded motion
 
     def open(self) -> FrameReader:
         """Open the stack, which must not have changed."""
@@ -180,7 +179,7 @@ class StackJob:
         rows = taken.shape[int(timing.scan_axis)]
         if self.given is not None:
             given = self.given[window.index]
-            if not isinstance(given, FreeMotion) or self.is_recorded:
+            if not isinstance(given, FreeMotion) or self.options.motion is not None:  # recorded
                 return given, given if isinstance(given, DetectedVibration) else None
             return given, tones_of_given(given, timing, len(taken), rows)
         detected = detect_vibration(taken, timing, **self.options.detection or {})
@@ -314,10 +313,7 @@ def plan_job(
     of_job = {"full_scale": full_scale, "device": device, "restoration": restoration, "progress": None}
     stated = ProcessStackOptions(**{**vars(options), **of_job})
     windows = cut_windows(info.shape[0], stated.window)
-    given = _given(stated, info, timing, windows)
-    job = StackJob(
-        Path(source), info, timing, replace(stated, given=None, motion=None), given, stated.motion is not None
-    )
+    job = StackJob(Path(source), info, timing, stated, _given(stated, info, timing, windows))
     if job.chosen.mosaic is not None:
         check_mosaic(job.chosen.mosaic, info.shape, str(source))
     check_optics(job.chosen.optics)
