@@ -2,7 +2,6 @@ from . import augmentation as augmentation
 from . import datasets as datasets
 from . import detection as detection
 from . import evaluation as evaluation
-from . import export as export
 from . import gyroscope as gyroscope
 from . import imaging as imaging
 from . import io as io
@@ -25,7 +24,6 @@ from .evaluation import MtfCurve as MtfCurve
 from .evaluation import psnr as psnr
 from .evaluation import slanted_edge_mtf as slanted_edge_mtf
 from .evaluation import ssim as ssim
-from .export import write_gcsv as write_gcsv
 from .gyroscope import AngularRates as AngularRates
 from .gyroscope import ClockAlignment as ClockAlignment
 from .gyroscope import RotationAlignment as RotationAlignment

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from rsvib_torch.checks.values import MistakesError, options, validate
+from rsvib_torch.checks.values import options, validate
 from rsvib_torch.files.reading import Table, read_toml
 from rsvib_torch.motion.timing import SensorSection, SensorTiming
 from rsvib_torch.options import RestorationOptions, ToneOptions, WindowOptions
@@ -64,7 +64,9 @@ def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, obj
         2000.0
     """
     data = {} if path is None else read_toml(Path(path))
-    source = "the command line" if path is None else str(path)
+    source = stated_in = "the command line" if path is None else str(path)
+    if sensor and path is not None:
+        stated_in = f"{source} and the command line"
     if sensor:
         stated = data.get("sensor", {})
         if isinstance(stated, dict):
@@ -72,14 +74,7 @@ def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, obj
             replaced = set(sensor).union(*(pair for pair in same if pair & set(sensor)))
             stated = {name: value for name, value in stated.items() if name not in replaced}
             data["sensor"] = {**stated, **sensor}
-    try:
-        content = validate(ConfigFile, data, source)
-    except MistakesError as error:
-        if path is None or not sensor:
-            raise
-        of_file = _mistakes_of_file(Path(path))
-        lines = (line if line in of_file else line.replace(source, "the command line", 1) for line in error.lines)
-        raise MistakesError(lines) from error
+    content = validate(ConfigFile, data, stated_in)
     return Config(
         source=source,
         timing=content.sensor.to_timing(),
@@ -89,12 +84,3 @@ def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, obj
         stack=data.get("stack", {}),
         path=None if path is None else Path(path),
     )
-
-
-def _mistakes_of_file(path: Path) -> tuple[str, ...]:
-    """Mistakes of a file alone, without options that replace its keys."""
-    try:
-        validate(ConfigFile, read_toml(path), str(path))
-    except MistakesError as error:
-        return error.lines
-    return ()

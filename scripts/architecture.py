@@ -5,10 +5,7 @@
 LAYERS: tuple[dict[str, str], ...] = (
     {"commands": "the rsvib program: options, progress, output on the terminal"},
     {"video": "process_video.py: videos in two passes; steadying.py; session.py: a running camera"},
-    {
-        "report": "results on disk: JSON, CSV, figures (plots.py), HTML page (page.py)",
-        "export": "motions for other programs: angular rates",
-    },
+    {"report": "results on disk: JSON, CSV, figures (plots.py), HTML page (page.py)"},
     {"config": "TOML files ↔ groups of options"},
     {"stacks": "process.py: windows, jobs, memory planning; run_folder.py: a run to a file, and how it resumes"},
     {"io": "stack_reading.py, stack_writing.py, formats.py (table of formats), one module per format"},

@@ -286,22 +286,6 @@ def channels_appear_last(shape: Sequence[int]) -> bool:
     return len(shape) >= 3 and shape[-1] <= 4 < min(shape[-3:-1])
 
 
-def _check_frame_axis(name: str, shape: tuple[int, ...]) -> None:
-    """Raise a ``ValueError`` if the frames appear to lie on another axis than the first, or second of a batch."""
-    order: tuple[int, ...] | None = None
-    if len(shape) == 3 and 4 * shape[2] <= min(shape[:2]):  # no camera has frames four times as high as wide
-        order, found, otherwise = (2, 0, 1), "(H, W, T)", f"{shape[0]} frames of {shape[1]} x {shape[2]} px"
-    elif len(shape) == 4 and shape[2] <= 4 < min(shape[:2]):
-        order, found, otherwise = (3, 2, 0, 1), "(H, W, C, T)", f"{shape[0]} frames of {shape[2]} x {shape[3]} px"
-    elif len(shape) == 5 and shape[1] == 3 and shape[2] > 4:
-        order, found, otherwise = (0, 2, 1, 3, 4), "(B, C, T, H, W)", f"3 frames of {shape[2]} channels"
-    if order is not None:
-        raise ValueError(
-            f"{name} of shape {shape} appear to be {found}: pass {name}.permute{order}, or "
-            f'channels="first" if these are {otherwise}'
-        )
-
-
 def channel_axis(name: str, shape: Sequence[int], channels: Channels) -> int:
     """The axis of the channels: -1 if they are last, -3 if they come before the image axes or do not exist.
 
@@ -310,25 +294,27 @@ def channel_axis(name: str, shape: Sequence[int], channels: Channels) -> int:
     pixels along each axis, or the frames on the last axis or behind three channels.
     """
     check_choice("channels", channels, (None, "first", "last"))
-    shape = tuple(shape)
+    shape, axes = tuple(shape), len(shape)
     appears_last = channels_appear_last(shape)
-    appears_first = len(shape) >= 4 and channels_appear_last((*shape[-2:], shape[-3]))
-    if len(shape) == 3 and appears_last and channels != "first":
-        raise ValueError(
-            f'{name} of shape {shape} appear to be one image (H, W, C): pass {name}[None] with channels="last"; '
-            f"{name}.permute(2, 0, 1) if the frames lie on the last axis; or "
-            f'channels="first" if these are {shape[0]} frames of {shape[1]} x {shape[2]} px'
-        )
-    if channels is None:
-        _check_frame_axis(name, shape)
-    if appears_last and channels is None:
-        order = (0, 3, 1, 2) if len(shape) == 4 else (0, 1, 4, 2, 3)
-        raise ValueError(
-            f'{name} of shape {shape} appear to have their channels last: pass channels="last" or '
-            f'{name}.permute{order}, or channels="first" if they have {shape[-3]} channels'
-        )
-    if appears_first and channels == "last":
+    if channels == "last" and axes >= 4 and channels_appear_last((*shape[-2:], shape[-3])):
         raise ValueError(
             f'{name} of shape {shape} appear to have their channels before the image axes: omit channels="last"'
         )
-    return -1 if channels == "last" and len(shape) > 3 else -3
+    # What frames of another order appear to be, and what is to be passed for them.
+    turned, orders = f"{name}.permute", {3: "(T, H, W)", 4: "(T, C, H, W)", 5: "(B, T, C, H, W)"}
+    alone = f'{name}[None] with channels="last"; {turned}(2, 0, 1) if the frames lie on the last axis'
+    last_first = f'channels="last" or {turned}{(0, 3, 1, 2) if axes == 4 else (0, 1, 4, 2, 3)}'
+    problem = None
+    if axes == 3 and appears_last and channels != "first":
+        problem = f"be one image (H, W, C): pass {alone}; or"
+    elif channels is None and axes == 3 and 4 * shape[2] <= min(shape[:2]):  # no camera has such high frames
+        problem = f"be (H, W, T): pass {turned}(2, 0, 1), or"
+    elif channels is None and axes == 4 and shape[2] <= 4 < min(shape[:2]):
+        problem = f"be (H, W, C, T): pass {turned}(3, 2, 0, 1), or"
+    elif channels is None and axes == 5 and shape[1] == 3 and shape[2] > 4:
+        problem = f"be (B, C, T, H, W): pass {turned}(0, 2, 1, 3, 4), or"
+    elif channels is None and appears_last and axes in (4, 5):
+        problem = f"have their channels last: pass {last_first}, or"
+    if problem is not None:
+        raise ValueError(f'{name} of shape {shape} appear to {problem} channels="first" if they are {orders[axes]}')
+    return -1 if channels == "last" and axes > 3 else -3

@@ -45,35 +45,12 @@ def verdicts(
     return {name: all(of_one[axis : axis + 1] == [True] for of_one in flags) for axis, name in enumerate(AXES)}
 
 
-def stack_answer(
-    frames: Path,
-    found: detection.DetectionResult,
-    pixel_size: float | None = None,
-    restored: stacks.RestoredFrames | None = None,
-    count: int = 0,
-) -> Answer:
-    """The vibration in a stack, also in units of length if the size of a pixel in m is given, and its restoration."""
+def stack_answer(frames: Path, found: detection.DetectionResult, pixel_size: float | None = None) -> Answer:
+    """The vibration in a stack, also in units of length if the size of a pixel in m is given."""
     answer = Answer({f"Vibration in {frames.name}": [found.summary()]}, {"detection": detection_data(found)})
     answer.reliable = verdicts([found])
     if pixel_size is not None:
         answer.results[f"For pixels of {1e6 * pixel_size:.6g} µm"] = [found.physical_summary(pixel_size)]
-    if restored is not None:
-        answer.results["Restoration"] = restoration_lines(restored, count)
-        answer.data["restoration"] = reports.restoration_data(restored)
-    return answer
-
-
-def windows_answer(
-    title: str,
-    manifest: stacks.StackManifest,
-    report: stacks.StackReport | None = None,
-) -> Answer:
-    """The vibration in the windows of a stack, and what was restored."""
-    vibration, restoration = manifest.lines()
-    found = [record.detection for record in manifest.windows]
-    answer = Answer({title: vibration}, {"windows": manifest.totals()}, reliable=verdicts(found))
-    if report is not None:
-        answer.results["Restoration"] = [report.summary(), *restoration[1:]]
     return answer
 
 
@@ -108,9 +85,8 @@ def restoration_lines(result: stacks.RestoredFrames, count: int) -> list[str]:
     return [wrapped(line) for line in lines]
 
 
-def restoration_of(run: stacks.StackReport, restored: Path) -> tuple[list[str], Table]:
+def restoration_of(run: stacks.StackReport) -> tuple[list[str], Table]:
     """What a run restored, as lines and as data, with warnings; of a single window with its verdict."""
-    note_lost(restored, run.not_kept)
     if run.windows == 1 and run.first is not None and run.first.restoration is not None:
         first = run.first.restoration
         warn_of_restoration(first)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import rsvib_torch
 from rsvib_torch import detection, io, stacks, video
@@ -14,7 +14,7 @@ from rsvib_torch.checks.values import options
 from rsvib_torch.commands import answers
 from rsvib_torch.commands.flat_command import Given, argument
 from rsvib_torch.commands.shared_options import PixelSizeOptions, RestorationCommand, VerdictOptions
-from rsvib_torch.commands.stack_commands import print_notes, read_frames
+from rsvib_torch.commands.stack_commands import print_notes
 from rsvib_torch.commands.terminal import Answer, current_output, warn, working
 from rsvib_torch.files.atomic import whole_folder
 from rsvib_torch.files.reading import Table
@@ -23,9 +23,6 @@ from rsvib_torch.text import number_of, printable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from torch import Tensor
-
-    from rsvib_torch.detection import DetectionResult
 
 
 _RESULTS = (*answers.OF_DETECTION, *answers.OF_WINDOWS, "before_after.png", "report.html")
@@ -41,7 +38,7 @@ class RunOptions(RestorationCommand, PixelSizeOptions, VerdictOptions):
     output: str = "restored.tif"
     """Name of the restored stack in that folder; its extension selects the format, e.g. .mp4 or .mkv for a video with
     the time stamps and the sound of the input. restored/ is a folder with a file for each frame: from a folder of TIFF
-    files, TIFF files of the same names, georeference, tiles and compression."""
+    files, TIFF files of the same names and georeference."""
     video: bool = False
     """Write a video: restored.mp4 (H.264) from .mp4, restored.mov from .mov, else restored.mkv (FFV1, without loss).
     Videos are followed frame by frame instead of in windows."""
@@ -76,34 +73,24 @@ def run(given: RunOptions) -> Answer:
     replaces = given.overwrite or "resume" in given.processing
     answers.check_folder(out, _RESULTS, replaces, given.inputs, out / output)
     current_output().work = stacks.work_folder(out / output)
-    info, common = given.info, given.of_stack
-    print_notes(info, settings)
-    chosen = WindowOptions(**{**settings.stack, **given.windows})
+    print_notes(given.info, settings)
+    window = WindowOptions(**{**settings.stack, **given.windows}).window
     # 1. Process windows, or a video of more than one window from frame to frame.
-    followed = bool(given.moved) or (given.video and io.is_video(frames) and info.shape[0] > chosen.window)
-    result = _process_video(given, out / output, common) if followed else _process(given, out / output, common, chosen)
-    manifest = stacks.read_manifest(result.manifest)
-    complete = result.resumed == result.windows and not given.report and given.pixel_size is None
-    if complete and _is_newer(out / "tones.csv", result.manifest):  # else it is of a run that was replaced
-        answer = answers.windows_answer(f"Vibration in {frames.name}", manifest, result)
-        answer.files += [out / name for name in dict.fromkeys((output, *_RESULTS)) if (out / name).exists()]
-        return answer
-    if followed:
-        shown = _show_video(given, out / output, info, manifest)
-    else:
-        shown = _show_window(given, result, info, common | _windows(given, chosen), manifest)
-    answers.note_lost(out / output, () if followed else result.not_kept)
+    followed = bool(given.moved) or (given.video and io.is_video(frames) and given.info.shape[0] > window)
+    result = _process_video(given, out / output) if followed else _process(given, out / output, window)
+    stored, first = stacks.read_manifest(result.manifest), result.first
+    page = _video_page(given, out / output, stored) if first is None else _window_page(given, first, stored)
     # 2. Figure, tables and page.
     with whole_folder(out) as folder:
         drawn = []
-        if len(shown.after):
+        if len(page.frames):
             with working("drawing the frames"):
-                reports.save_figure(_comparison(shown), folder / "before_after.png")
+                reports.save_figure(_comparison(page), folder / "before_after.png")
             drawn = ["before_after.png"]
         names = [output, *drawn, "manifest.json"] if followed else [*drawn, output, "manifest.json"]
-        answer = _describe(folder, given, result, shown, names)
+        answer = _describe(folder, given, result, page, stored, names)
         if given.report:
-            pages = _write_page(folder, given, shown, answer)
+            pages = _write_page(folder, page, stored, answer)
             answers.check_folder(out, pages, overwrite=True, inputs=given.inputs)
             names = list(dict.fromkeys(pages + names))  # the page shows the curves of offsets.png as well
         elif result.restored:
@@ -111,16 +98,11 @@ def run(given: RunOptions) -> Answer:
             step = f"write a page with all figures:\n  {command} --resume --report"
             answer.next_steps.insert(0, step)
     if followed:
-        _describe_video(answer, shown.stored, result)
+        _describe_video(answer, stored, result)
     if given.overwrite:
         answers.remove_old(out, _RESULTS, names)
     answer.files += [out / name for name in names]
     return answer
-
-
-def _is_newer(table: Path, manifest: Path) -> bool:
-    """Whether a table exists and was written after the manifest, so that both are of the same run."""
-    return table.exists() and table.stat().st_mtime_ns >= manifest.stat().st_mtime_ns
 
 
 def _name_of_output(given: RunOptions) -> str:
@@ -138,102 +120,100 @@ def _name_of_output(given: RunOptions) -> str:
     return output
 
 
-@dataclass(frozen=True)
-class _Shown:
-    """Frames before and after restoration, for the figure and the page, and what is known of them."""
-
-    before: Tensor  # (T, H, W) or (T, C, H, W), full scale 1; of a mosaic in colour
-    after: Tensor  # the same frames restored or as taken, or one image of them; empty if none could be used
-    first: int  # number of the first one in the stack
-    was_restored: bool  # whether ``after`` is restored
-    timing: rsvib_torch.SensorTiming
-    stored: stacks.StackManifest  # all windows
-    detection: DetectionResult | None = None  # of a steady vibration
-    restoration: stacks.RestoredFrames | None = None  # its verdict
-
-    @property
-    def windows(self) -> stacks.StackManifest | None:
-        """The windows, unless one vibration of all frames is shown."""
-        return None if len(self.stored.windows) == 1 and self.detection is not None else self.stored
+def _process(given: RunOptions, restored: Path, window: int) -> stacks.StackReport:
+    """Process a stack in windows; the first one is computed again if it was complete before."""
+    options = given.of_stack | {"window": window, "force": given.force, "detection": given.settings.detection}
+    frames, timing, counts = given.frames, given.settings.timing, given.info.shape[0] > window
+    of_run = options | given.processing | {"manifest": given.out / "manifest.json"}
+    with working(f"restoring {frames.name}", counts=counts) as progress:
+        result = stacks.process_stack(frames, restored, timing, **of_run, progress=progress if counts else None)
+    if result.bad_frames:
+        warn(f"{number_of(result.bad_frames, 'frame')} could not be used: see manifest.json")
+    answers.note_lost(restored, result.not_kept)
+    if result.first is not None:
+        return result
+    options |= {name: value for name, value in given.processing.items() if name in ("memory", "workers")}
+    return replace(result, first=next(iter(stacks.iterate_stack(frames, timing, **options))))
 
 
-def _windows(given: RunOptions, chosen: WindowOptions) -> Table:
-    """Options of a run in windows."""
-    return {"window": chosen.window, "force": given.force, "detection": given.settings.detection}
-
-
-def _process(given: RunOptions, restored: Path, common: Table, chosen: WindowOptions) -> stacks.StackReport:
-    """Process a stack in windows."""
-    of_run = common | _windows(given, chosen) | given.processing | {"manifest": given.out / "manifest.json"}
-    counts = given.info.shape[0] > chosen.window
-    with working(f"restoring {given.frames.name}", counts=counts) as progress:
-        of_run["progress"] = progress if counts else None
-        return stacks.process_stack(given.frames, restored, given.settings.timing, **of_run)
-
-
-def _process_video(given: RunOptions, restored: Path, common: Table) -> stacks.StackReport:
+def _process_video(given: RunOptions, restored: Path) -> stacks.StackReport:
     """Process a video from frame to frame."""
-    restoration = dict(common["restoration"])
-    if {**given.settings.restoration, **given.restoration}.get("saturation") is None:
+    restoration = dict(given.of_stack["restoration"])
+    if {**given.settings.restoration, **given.restoration}.get("saturation") in (None, "auto"):
         restoration.pop("saturation", None)  # that of integer formats
-    of_run = common | {"restoration": restoration} | given.moved | given.windows | given.processing
+    of_run = given.of_stack | {"restoration": restoration} | given.moved | given.windows | given.processing
     of_run["manifest"] = given.out / "manifest.json"
     with working(f"restoring {given.frames.name}", counts=True) as progress:
         return video.process_video(given.frames, restored, given.settings.timing, **of_run, progress=progress)
 
 
-def _show_window(
-    given: RunOptions, result: stacks.StackReport, info: io.StackInfo, options: Table, stored: stacks.StackManifest
-) -> _Shown:
-    """Frames of the first window, which is computed with these options if it was complete before."""
-    settings, frames, first = given.settings, given.frames, result.first
-    if first is None:
-        resources = {name: value for name, value in given.processing.items() if name in ("memory", "workers")}
-        first = next(iter(stacks.iterate_stack(frames, settings.timing, **options, **resources)))
-    if result.bad_frames:
-        warn(f"{number_of(result.bad_frames, 'frame')} could not be used: see manifest.json")
-    after, restoration = first.frames.cpu(), options["restoration"]
-    # the page shows all frames of the window, the figure one of them: of a joint image, that in the middle
+def _page(given: RunOptions, stored: stacks.StackManifest, **shown: Any) -> reports.Report:
+    """The page of a run that shows some frames."""
+    return reports.Report(
+        title=printable(f"Vibration in {given.frames.name}"),
+        subtitle=printable(f"{given.frames}, camera of {given.settings.source}"),
+        made_with=f"rsvib_torch {rsvib_torch.__version__}: {current_output().command}",
+        **{"windows": stored, "timing": io.timing_from_first_frame(given.settings.timing, given.info), **shown},
+    )
+
+
+def _window_page(given: RunOptions, first: stacks.WindowResult, stored: stacks.StackManifest) -> reports.Report:
+    """The page of the first window: all of its frames, or without a page one of them: of a joint image, the middle."""
+    after, mosaic = first.frames.cpu(), given.of_stack["restoration"].get("mosaic")
     indices = first.indices or [index for index in first.window.written if index not in first.bad_frames]
     if not given.report:
         middle = 0 if first.indices else len(indices) // 2
         indices, after = indices[middle : middle + 1], after[:1]
-    before = read_frames(frames, indices, options["full_scale"]) if len(after) else after
-    if len(before) and restoration.get("mosaic") is not None:
-        before = preparation.colour_frames(before, restoration["mosaic"])
-    found = first.detection if isinstance(first.detection, detection.DetectionResult) else None
-    timing = io.timing_from_first_frame(settings.timing, info)
-    if found is not None and found.timing is not None and result.windows > 1:
-        timing = found.timing
-    shown = (before, after, next(iter(indices), 0), first.restored, timing, stored)
-    return _Shown(*shown, detection=found, restoration=first.restoration)
+    before = io.read_frames(given.frames, indices, given.scale).nan_to_num(0.0) if len(after) else after
+    if len(before) and mosaic is not None:
+        before = preparation.colour_frames(before, mosaic)
+    restored = after if first.restored else None
+    shown: Table = {"frames": before, "restored": restored, "first": next(iter(indices), 0)}
+    if first.restoration is not None:
+        shown["verdict"] = first.restoration.verdict
+    if isinstance(first.detection, detection.DetectionResult):  # of a steady vibration
+        shown["detection"] = first.detection
+        if len(stored.windows) == 1:
+            shown["windows"] = None
+        elif first.detection.timing is not None:
+            shown["timing"] = first.detection.timing
+    return _page(given, stored, **shown)
 
 
-def _show_video(given: RunOptions, restored: Path, info: io.StackInfo, stored: stacks.StackManifest) -> _Shown:
-    """Two frames near the begin of a video."""
+def _video_page(given: RunOptions, restored: Path, stored: stacks.StackManifest) -> reports.Report:
+    """The page of two frames near the begin of a video."""
     bad = stored.bad_frames
-    pairs = (number for number in range(info.shape[0] - 1) if str(number) not in bad and str(number + 1) not in bad)
-    first = min(pairs, key=lambda number: abs(number - 8), default=None)  # earlier frames must be decoded as well
+    usable = (number for number in range(given.info.shape[0] - 1) if not {str(number), str(number + 1)} & bad.keys())
+    first = min(usable, key=lambda number: abs(number - 8), default=None)  # earlier frames must be decoded as well
     indices = () if first is None else (first, first + 1)  # no two neighbours could be used
-    before = read_frames(given.frames, indices, stored.settings["full_scale"])
+    before, after = io.read_frames(given.frames, indices, stored.settings["full_scale"]), None
     if stored.margins is not None:
         before = video.Margins(**stored.margins).cut(before)
-    after = read_frames(restored, indices, None)
-    is_restored = any(record.frames == "restored" for record in stored.windows)
-    return _Shown(before, after, first or 0, is_restored, given.settings.timing, stored)
+    if any(record.frames == "restored" for record in stored.windows):
+        after = io.read_frames(restored, indices)
+    return _page(given, stored, frames=before, restored=after, first=first or 0, timing=given.settings.timing)
 
 
-def _describe(folder: Path, given: RunOptions, result: stacks.StackReport, shown: _Shown, names: list[str]) -> Answer:
+def _describe(
+    folder: Path,
+    given: RunOptions,
+    result: stacks.StackReport,
+    page: reports.Report,
+    stored: stacks.StackManifest,
+    names: list[str],
+) -> Answer:
     """Write the tables and figures of one vibration of all frames, or of the windows; their names are added."""
-    frames, found, judged = given.frames, shown.detection, shown.restoration
-    if shown.windows is None and found is not None and judged is not None:
-        names += answers.write_detection(folder, found, shown.timing, given.pixel_size)
-        answers.warn_of_restoration(judged)
-        answer = answers.stack_answer(frames, found, given.pixel_size, judged, given.info.shape[0])
+    frames, found, title = given.frames, page.detection, f"Vibration in {given.frames.name}"
+    if page.windows is None and found is not None and result.first is not None and result.first.error is None:
+        names += answers.write_detection(folder, found, page.timing, given.pixel_size)
+        answer = answers.stack_answer(frames, found, given.pixel_size)
+        answer.results["Restoration"], answer.data["restoration"] = answers.restoration_of(result)
         answer.next_steps = answers.steps_after_detection(found, frames, given.settings)
     else:
-        names += answers.write_windows(folder, shown.stored, given.pixel_size)
-        answer = answers.windows_answer(f"Vibration in {frames.name}", shown.stored, result)
+        names += answers.write_windows(folder, stored, given.pixel_size)
+        answer = Answer({title: stored.lines()[0]}, {"windows": stored.totals()})
+        answer.reliable = answers.verdicts([record.detection for record in stored.windows])
+        answer.results["Restoration"] = [result.summary(), *stored.lines()[1][1:]]
     if not given.video and io.is_video(frames) and result.restored < result.windows:
         answer.next_steps.insert(0, answers.run_step(frames, given.out / "followed", given.settings.arguments))
     return answer
@@ -262,33 +242,21 @@ def _describe_video(answer: Answer, stored: stacks.StackManifest, result: stacks
     answer.data["shaking"] = stored.shaking
 
 
-def _comparison(shown: _Shown) -> Figure:
+def _comparison(page: reports.Report) -> Figure:
     """Draw a frame before and after restoration."""
-    before = shown.before[0 if len(shown.after) == len(shown.before) else len(shown.before) // 2]
-    raw = preparation.enlarged(before, shown.after.shape[-1] // before.shape[-1])
-    names = ("input", "restored" if shown.was_restored else "unchanged")
-    return reports.comparison_figure(raw, shown.after[0].nan_to_num(0.0), names=names)
+    frames, after = page.frames, page.restored
+    if after is None:
+        return reports.comparison_figure(frames[0], frames[0], names=("input", "unchanged"))
+    before = frames[0 if len(after) == len(frames) else len(frames) // 2]
+    raw = preparation.enlarged(before, after.shape[-1] // before.shape[-1])
+    return reports.comparison_figure(raw, after[0].nan_to_num(0.0))
 
 
-def _write_page(folder: Path, given: RunOptions, shown: _Shown, answer: Answer) -> list[str]:
+def _write_page(folder: Path, page: reports.Report, stored: stacks.StackManifest, answer: Answer) -> list[str]:
     """Write the page, and return the names of its files."""
-    if not len(shown.after) or (shown.detection is None and not shown.stored.is_removed):
+    if not len(page.frames) or (page.detection is None and not stored.is_removed):
         warn("report.html is not written: the vibration of the first window is not known")
         return []
-    judged = shown.restoration
-    page = reports.Report(
-        title=printable(f"Vibration in {given.frames.name}"),
-        subtitle=printable(f"{given.frames}, camera of {given.settings.source}"),
-        made_with=f"rsvib_torch {rsvib_torch.__version__}: {current_output().command}",
-        windows=shown.windows,
-        frames=shown.before,
-        restored=shown.after if shown.was_restored else None,
-        timing=shown.timing,
-        detection=shown.detection,
-        verdict=None if judged is None else judged.verdict,
-        first=shown.first,
-        next_steps=answer.next_steps,
-        texts={title: "\n".join(lines) for title, lines in answer.results.items()},
-    )
+    texts = {title: "\n".join(lines) for title, lines in answer.results.items()}
     with working("writing the page"):
-        return reports.write_report_page(folder, page)
+        return reports.write_report_page(folder, replace(page, texts=texts, next_steps=answer.next_steps))

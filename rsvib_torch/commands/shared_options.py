@@ -215,9 +215,6 @@ class RestorationCommand(StackCommand):
             if given["joint"] != "all" and not (given["joint"].isdecimal() and int(given["joint"]) >= 1):
                 raise ValueError(f"--joint must be 'all' or a number of frames, got {given['joint']!r}")
             given["joint"] = given["joint"] == "all" or int(given["joint"])
-            if given["joint"] > info.shape[0]:
-                more = f"--joint {given['joint']} exceeds the number of frames, {info.shape[0]}"
-                raise ValueError(f"{more}; 'all' uses all")
         options |= given
         checked = RestorationOptions(**options)
         if options.get("saturation") == "auto":

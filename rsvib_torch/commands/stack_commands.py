@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,7 +14,7 @@ from rsvib_torch.commands import answers
 from rsvib_torch.commands import shared_options as shared
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.terminal import Answer, current_output, note, warn, working
-from rsvib_torch.files.atomic import whole_folder
+from rsvib_torch.files.atomic import check_writable, whole_folder
 from rsvib_torch.files.reading import Table
 from rsvib_torch.options import FreeMotionOptions, MotionUnit, ProcessStackOptions
 
@@ -37,18 +35,6 @@ def load(given: shared.StackCommand) -> tuple[Tensor, rsvib_torch.SensorTiming]:
         frames = io.read_stack(given.frames, full_scale=given.scale)
     print_notes(given.info, given.settings)
     return frames.to(given.torch_device), io.timing_from_first_frame(given.settings.timing, given.info)
-
-
-def read_frames(path: Path, indices: Sequence[int], full_scale: float | None) -> Tensor:
-    """Frames of a stack, (T, H, W) or (T, C, H, W) with full scale 1 and 0 for missing pixels."""
-    import numpy as np  # noqa: PLC0415
-
-    with closing(io.open_stack(path)) as reader:
-        info = reader.info
-        pixels = np.empty((len(indices), *info.shape[1:]), info.dtype)
-        for place, index in enumerate(indices):
-            pixels[place] = reader.frame(index)
-    return io.counts_to_frames(pixels, full_scale or info.full_scale, str(path), info.nodata).nan_to_num(0.0)
 
 
 def print_notes(info: io.StackInfo, config: Config) -> None:
@@ -172,10 +158,8 @@ def restore(given: RestoreOptions) -> Answer:
     replaces = given.overwrite or "resume" in given.processing
     shared.check_new(outputs, replaces, [*given.inputs, vibration, given.motion, given.lens_profile])
     current_output().work = stacks.work_folder(given.restored)
+    check_writable(given.restored, folder=not given.restored.suffix)
     info, scale, chosen = given.info, given.scale, given.of_stack["restoration"]
-    shape = info.restored_as(chosen.get("scale", 1), chosen.get("mosaic")).shape
-    shape = (1, *shape[1:]) if chosen.get("joint") is True else shape
-    io.check_stack_target(given.restored, shape, dtype=info.dtype, full_scale=scale, like=info)
     of_run = given.of_stack | {"force": given.force} | given.processing
     # 1. The vibration of all frames, or the motion on the clock of the frames.
     if vibration is not None and given.motion is None:
@@ -195,7 +179,8 @@ def restore(given: RestoreOptions) -> Answer:
     with working(f"restoring {frames.name}", counts=counts) as progress:
         of_run["progress"] = progress if counts else None
         run = stacks.process_stack(frames, given.restored, settings.timing, **of_run)
-    answer.results["Restoration"], answer.data["restoration"] = answers.restoration_of(run, given.restored)
+    answers.note_lost(given.restored, run.not_kept)
+    answer.results["Restoration"], answer.data["restoration"] = answers.restoration_of(run)
     answer.files += [given.restored, given.manifest]
     return answer
 
@@ -206,8 +191,12 @@ def _motion_of_frames(given: RestoreOptions, path: Path, info: StackInfo, answer
     ignore = stacks.mask_of_regions(given.ignore or (), (info.shape[-2], info.shape[-1]))
     print_notes(info, given.settings)
     if isinstance(recorded, rsvib_torch.FreeMotion) and given.offset is not None:
-        return _placed(given, recorded, timing, given.offset)
-    camera = _camera(given)
+        return recorded.retimed(given.offset)
+    camera = None
+    if given.lens_profile is not None:
+        camera = rsvib_torch.Camera.from_gyroflow(given.lens_profile, info.shape[-1], info.shape[-2])
+    elif given.unit is None and given.focal_length is not None:
+        camera = rsvib_torch.Camera(given.focal_length)
     with working("aligning the recording"):
         found = stacks.align_stack(given.frames, info, timing, recorded, camera=camera, ignore=ignore)
     answer.results["Recording on the clock of the frames"] = [found.summary()]
@@ -230,24 +219,3 @@ def _recorded(given: RestoreOptions, path: Path) -> rsvib_torch.FreeMotion | rsv
     if given.lens_profile is not None and given.focal_length is not None:
         raise ValueError("--lens-profile and --focal-length both state the focal length: give one of them")
     return rsvib_torch.read_gyroscope(path)
-
-
-def _camera(given: RestoreOptions) -> rsvib_torch.Camera | None:
-    """The stated lens of a gyroscope."""
-    if given.lens_profile is not None:
-        return rsvib_torch.Camera.from_gyroflow(given.lens_profile, given.info.shape[-1], given.info.shape[-2])
-    return None if given.unit is not None or given.focal_length is None else rsvib_torch.Camera(given.focal_length)
-
-
-def _placed(
-    given: RestoreOptions, recorded: rsvib_torch.FreeMotion, timing: rsvib_torch.SensorTiming, offset: float
-) -> rsvib_torch.FreeMotion:
-    """A recording whose clock is stated, if it covers the frames."""
-    info, placed = given.info, recorded.retimed(offset)
-    starts = io.timing_from_first_frame(timing, info).frame_starts(info.shape[0])
-    readout = info.shape[int(timing.scan_axis)] * timing.row_time + timing.exposure_time
-    last = float(starts[-1] - starts[0]) + readout
-    if placed.start > 1e-9 or placed.end < last - 1e-9:  # s; rounding of the offset
-        needed = f"the frames need {offset:.6g} to {offset + last:.6g} s"
-        raise ValueError(f"{given.motion}: covers {recorded.start:.6g} to {recorded.end:.6g} s, {needed}")
-    return placed

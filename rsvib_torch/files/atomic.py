@@ -32,12 +32,7 @@ def nearest_folder(path: Path) -> Path:
 
 def sync(path: Path) -> None:
     """Return when the content of a file, or the names in a folder, are on the disk: a power loss does not undo them."""
-    try:
-        file = os.open(path, os.O_RDONLY)
-    except PermissionError:
-        if path.is_dir():  # a folder in which files may be created but not listed
-            return
-        raise
+    file = os.open(path, os.O_RDONLY)
     try:
         os.fsync(file)
     except OSError as error:
@@ -211,27 +206,17 @@ def _inside(path: _Path, folder: _Path) -> bool:
     return any(place != above and place.is_relative_to(above) for place in _places(path) for above in _places(folder))
 
 
-def _same(path: _Path, other: _Path) -> bool:
-    """Whether two paths are names of one file."""
+def _same_file(path: _Path, other: _Path) -> bool:
     with suppress(OSError):  # one of them does not exist
-        if os.path.samefile(path, other):
-            return True
-    return not _places(path).isdisjoint(_places(other))
+        return os.path.samefile(path, other)
+    return False
 
 
-def _conflict(output: _Path, source: _Path) -> str | None:
-    """Why writing a file would change an input; None if it does not."""
-    if _same(output, source):
-        return f"it is the input {source}"
-    if _inside(source, output):
-        return f"it contains the input {source}"
-    if _inside(output, source):
-        return f"it lies inside the input folder {source}"
-    if os.path.isfile(output):
-        for member in (Path(place, name) for place, _, names in os.walk(source) for name in names):
-            if os.path.exists(member) and os.path.samefile(member, output):
-                return f"it is the same file as {member} of the input"
-    return None
+def _relation(path: _Path, other: _Path) -> str:
+    """How a file to write is related to one that this would change; empty if it is not."""
+    if _same_file(path, other) or not _places(path).isdisjoint(_places(other)):
+        return "is"
+    return "contains" if _inside(other, path) else "lies inside" if _inside(path, other) else ""
 
 
 def check_outputs(outputs: Iterable[_Path], inputs: Iterable[_Path], *, folder: _Path | None = None) -> None:
@@ -247,11 +232,12 @@ def check_outputs(outputs: Iterable[_Path], inputs: Iterable[_Path], *, folder: 
         places = [(f"cannot write {output}", output, "name") for output in outputs]
         if folder is not None and (os.path.isdir(source) or not _inside(source, folder)):
             places.insert(0, (f"cannot write into {folder}", folder, "folder"))
+        members = [Path(place, name) for place, _, names in os.walk(source) for name in names]
         for problem, place, remedy in places:
-            reason = _conflict(place, source)
-            if reason is not None:
-                raise ValueError(f"{problem}: {reason}; choose another {remedy}")
+            relation, member = _relation(place, source), next((one for one in members if _same_file(one, place)), None)
+            if relation or member:
+                found = f"{relation} the input {source}" if relation else f"is the same file as {member} of the input"
+                raise ValueError(f"{problem}: it {found}; choose another {remedy}")
     for one, other in combinations(outputs, 2):
-        if (same := _same(one, other)) or _inside(one, other) or _inside(other, one):
-            reason = "they are the same file" if same else "one lies inside the other"
-            raise ValueError(f"cannot write {one} and {other}: {reason}; choose two names")
+        if relation := _relation(one, other):
+            raise ValueError(f"cannot write {one} and {other}: the first {relation} the second; choose two names")

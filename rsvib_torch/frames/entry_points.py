@@ -156,12 +156,5 @@ def entry_point(options: Callable[..., object], function: Callable[..., object])
                 "that move by themselves, or are far apart in time; use other frames, or for a motion with constant "
                 "acceleration detect_vibration(..., image_acceleration=True)"
             ) from error
-        except RuntimeError as error:
-            if torch._C._functorch.peek_interpreter_stack() is None:  # no transform of torch.func
-                raise
-            raise TypeError(
-                f"{function.__name__} does not support this transform of torch.func: use torch.autograd for "
-                "derivatives, and a batch (B, T, C, H, W) instead of vmap"
-            ) from error
 
     return outside_graphs(flat_options(options, solved))

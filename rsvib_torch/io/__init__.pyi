@@ -4,15 +4,14 @@ from .frame_times import describe_stack as describe_stack
 from .frame_times import exposure_times as exposure_times
 from .frame_times import stated_rate as stated_rate
 from .frame_times import timing_from_first_frame as timing_from_first_frame
-from .full_scale import counts_to_frames as counts_to_frames
 from .stack_info import H264 as H264
 from .stack_info import StackInfo as StackInfo
 from .stack_info import is_video as is_video
 from .stack_info import split_range as split_range
 from .stack_reading import open_stack as open_stack
+from .stack_reading import read_frames as read_frames
 from .stack_reading import read_stack as read_stack
 from .stack_reading import read_stack_info as read_stack_info
-from .stack_writing import check_stack_target as check_stack_target
 from .stack_writing import metadata_not_kept as metadata_not_kept
 from .stack_writing import stack_files as stack_files
 from .stack_writing import write_stack as write_stack

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rsvib_torch.checks.values import needed_package
-from rsvib_torch.io.frame_reader import FrameReader, contiguous_reader, readable_stack
+from rsvib_torch.io.frame_reader import FrameReader, check_held, contiguous_reader, readable_stack
 from rsvib_torch.io.stack_info import StackInfo, attributes_of, info_of_array
 from rsvib_torch.numerics.tables import Array
 
@@ -51,20 +51,6 @@ def _find_dataset(file: File) -> Dataset:
     return dataset
 
 
-def _check_dataset(dataset: Dataset, file_size: int) -> int:
-    """Size of a chunk in bytes; a ``ValueError`` if the pixels cannot be in the file, before memory is allocated."""
-    stored = dataset.id.get_storage_size()
-    needed = int(np.prod(dataset.shape, dtype=object)) * dataset.dtype.itemsize
-    compressed = dataset.compression or dataset.id.get_create_plist().get_nfilters()
-    largest_ratio = 5000 if compressed else 1  # of pixels to stored bytes; gzip reaches 1032
-    if stored > file_size or needed > largest_ratio * stored:
-        raise ValueError(f"its header states {needed} bytes of pixels, the file holds {stored}")
-    chunk: int = math.prod(dataset.chunks or (1,)) * int(dataset.dtype.itemsize)
-    if chunk > max(needed, 1 << 26):  # 64 MiB are accepted even if the stack is smaller
-        raise ValueError(f"its chunks of {chunk} bytes are larger than the stack of {needed}")
-    return chunk
-
-
 def open_hdf5(path: Path) -> FrameReader:
     """Open the dataset of a file that has the shape of a stack."""
     h5py = _h5py()
@@ -74,7 +60,8 @@ def open_hdf5(path: Path) -> FrameReader:
             dataset = _find_dataset(file)
             shape = tuple(int(size) for size in dataset.shape)
             info = info_of_array(shape, dataset.dtype, dict(dataset.attrs))
-            chunk = _check_dataset(dataset, path.stat().st_size)
+            check_held(info.shape[0] * info.frame_bytes, min(dataset.id.get_storage_size(), path.stat().st_size))
+            chunk = math.prod(dataset.chunks or (1,)) * int(dataset.dtype.itemsize)
             name, sides = dataset.name, dataset.chunks or (1, *shape[1:])
         # 2. Frames. HDF5 keeps decoded chunks of several frames until the last of their frames was read; one chunk
         # besides: measured with gzip, lzf, shuffle and without compression.

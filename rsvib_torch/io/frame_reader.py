@@ -85,6 +85,15 @@ def part_reader(reader: FrameReader, start: int, end: int | None) -> FrameReader
     return FrameReader(reader.path, part, lambda index: reader.frame(start + index), reader.close)
 
 
+_LARGEST_RATIO = 8800  # of pixels to stored bytes: deflate reaches 1032, and PNG files may have 1 bit per byte
+
+
+def check_held(pixels: int, stored: int) -> None:
+    """Raise a ``ValueError`` if bytes of pixels cannot be in a number of stored bytes, before memory is allocated."""
+    if pixels > _LARGEST_RATIO * stored:
+        raise ValueError(f"its header states {pixels} bytes of pixels, which {stored} bytes cannot hold")
+
+
 @contextmanager
 def readable_stack(path: Path, kind: str) -> Iterator[None]:
     """Convert any exception of a decoder of a ``kind`` of files into a ``ValueError``, except a missing permission."""

@@ -17,18 +17,16 @@ from PIL import ExifTags, Image
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile, putchunk
 
-from rsvib_torch.files.reading import Table
-from rsvib_torch.io.frame_reader import FrameError, FrameReader, readable_stack
+from rsvib_torch.io.frame_reader import FrameError, FrameReader, check_held, readable_stack
 from rsvib_torch.io.full_scale import known_full_scale
 from rsvib_torch.io.stack_info import DIFFERENT, StackInfo, Tag, exif_fields
-from rsvib_torch.io.tiff import open_tiff, storage_of, write_tiff
+from rsvib_torch.io.tiff import open_tiff, write_tiff
 from rsvib_torch.numerics.tables import Array
 
 _PNG, _TIFF, _JPEG = (".png",), (".tif", ".tiff"), (".jpg", ".jpeg")
 _KINDS = {"PNG": _PNG, "TIFF": _TIFF, "JPEG": _JPEG}
 _PNG_TYPES = ("uint8", "uint16")
 _FULL_SCALE = "full_scale"  # keyword of the text in a PNG file
-_LARGEST_RATIO = 1100  # of pixels to bytes of a PNG file; deflate reaches 1032
 _CHANNELS = {"1": 1, "L": 1, "I;16": 1, "P": 3, "RGB": 3, "LA": 4, "RGBA": 4}  # of decoded pixels, by mode
 _LONGEST_HEADER = 2**24  # bytes before the pixels: EXIF data and previews have 64 KB each, colour profiles 3 MB
 _PNG_HEADER = 8 + 25  # bytes of the signature and the chunk with the size
@@ -55,8 +53,7 @@ def _open_image(path: Path) -> FrameReader:
         if "transparency" in image.info and channels == 3:  # one transparent value of a grey image is not decoded
             channels = 4
         size, nbytes = f"{image.width} x {image.height} px", image.width * image.height * channels * dtype.itemsize
-        if is_png and nbytes > 8 * _LARGEST_RATIO * file_size:  # 1 bit is 1 byte
-            raise ValueError(f"its header states {size}, which {file_size} bytes cannot hold")
+        check_held(nbytes, file_size)
         if file_size > 4 * nbytes + _LONGEST_HEADER:
             raise ValueError(f"{file_size} bytes are too many for {size}")
         shape = (1, image.height, image.width) if channels == 1 else (1, channels, image.height, image.width)
@@ -113,7 +110,7 @@ def _frame_files(path: Path) -> list[Path]:
     if len(found) > 1:
         raise ValueError(f"{path}: the folder contains both {' and '.join(found)} files; expected one kind")
     if not found:
-        raise ValueError(f"{path}: the folder contains no PNG, TIFF or JPEG files")
+        raise ValueError(f"{path}: the folder contains no PNG, TIFF or JPEG files; of a Zarr store, write HDF5")
 
     def parts(file: Path) -> list[tuple[int, int, str]]:
         split = re.split(r"(\d+)", file.name)
@@ -197,14 +194,13 @@ def _write_file(file: Path, info: StackInfo, frame: Array, source: Path | None =
     if file.suffix.lower() in _PNG:
         encode_png(file, np.asarray(frame, dtype=info.dtype), one)
         return
-    storage: Table = {}
     with suppress(ValueError):  # a damaged file, whose frame is written as one without data
         if source is not None:
             with closing(_open_image(source)) as reader:
-                like, storage = reader.info, storage_of(source)
+                like = reader.info
             times = None if like.time_error else like.frame_times
             one = replace(one, frame_times=times, metadata=like.with_shape(one.shape).metadata)
-    write_tiff(file, one, iter([frame]), None, storage)
+    write_tiff(file, one, iter([frame]), None)
 
 
 def write_images(path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None) -> None:

@@ -65,7 +65,7 @@ class StackInfo(Summarised):
             are decoded together.
         camera: Make and model of the camera, if the file states them (EXIF of JPEG and PNG, tags of videos).
         files: The file of each frame, of a folder of TIFF files. Frames that are restored to a folder get their names,
-            metadata, tiles and compression.
+            metadata.
 
     Example:
         >>> import rsvib_torch as rsv

@@ -148,6 +148,16 @@ def _read_pixels(
     return parts[0] if len(parts) == 1 else np.concatenate(parts), stated, first
 
 
+def read_frames(path: PathLike, indices: Sequence[int], full_scale: float | None = None) -> Tensor:
+    """Frames of a stack by their numbers, as ``read_stack`` returns them."""
+    with closing(open_stack(path)) as reader:
+        info = reader.info
+        pixels = np.empty((len(indices), *info.shape[1:]), info.dtype)
+        for place, index in enumerate(indices):
+            pixels[place] = reader.frame(index)
+    return counts_to_frames(pixels, full_scale or info.full_scale, str(path), info.nodata)
+
+
 def load_files(paths: Sequence[PathLike], full_scale: float | None) -> LoadedFrames:
     """Frames of files as the argument ``frames`` of a function, with the times of the first file."""
     pixels, full_scale, first = _read_pixels(paths, full_scale, as_counts=True)

@@ -57,18 +57,6 @@ def _planned(shape: tuple[int, ...], dtype: str | None, full_scale: float | None
     return replace(kept, dtype=info.dtype, full_scale=full_scale, frame_times=times, time_error=0.0)
 
 
-def check_stack_target(
-    path: PathLike,
-    shape: tuple[int, ...],
-    *,
-    dtype: str | None = None,
-    full_scale: float | None = None,
-    like: StackInfo | None = None,
-) -> None:
-    """Raise the error that ``write_stack`` would raise for frames of this shape, before they are computed."""
-    check_info_target(Path(path), _planned(shape, dtype, full_scale, like))
-
-
 def metadata_not_kept(like: StackInfo, path: PathLike, shape: tuple[int, ...]) -> tuple[str, ...]:
     """What a file states about its frames and the file ``path`` with the restored frames will not state.
 

@@ -7,7 +7,7 @@ those that are not are named, so that the user learns what is lost.
 import json
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -17,14 +17,12 @@ import numpy as np
 import tifffile
 
 from rsvib_torch.files.reading import Table
-from rsvib_torch.io.frame_reader import FrameError, FrameReader, contiguous_reader, readable_stack
+from rsvib_torch.io.frame_reader import FrameError, FrameReader, check_held, contiguous_reader, readable_stack
 from rsvib_torch.io.full_scale import check_dtype
 from rsvib_torch.io.stack_info import Scope, StackInfo, Tag, attributes_of, fields_of_attributes
 from rsvib_torch.numerics.tables import Array
 
 _PHOTOMETRIC: tuple[int, ...] = (tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.RGB)
-_LOSSLESS = {1, 5, 8, 32946, 32773, 34925, 50000}  # none, LZW, Deflate (two codes), PackBits, LZMA, Zstandard
-_LARGEST_RATIO = 5000  # of pixels to the size of the file; deflate reaches 1032
 
 
 class _Page(NamedTuple):
@@ -153,9 +151,7 @@ def open_tiff(path: Path) -> FrameReader:
         if offset is not None:
             stored_dtype = dtype.newbyteorder(tif.byteorder)
             return contiguous_reader(path, info, offset, stored_dtype, channels_last=channels_last)
-        nbytes = info.shape[0] * info.frame_bytes
-        if nbytes > _LARGEST_RATIO * size:
-            raise ValueError(f"its header states {nbytes} bytes of pixels, which {size} bytes cannot hold")
+        check_held(info.shape[0] * info.frame_bytes, size)
         if sum(complete) < 0.5 * len(complete):
             raise ValueError(f"truncated: pixels of page {complete.index(False)} lie beyond the end of the file")
         over_pages = shape[: len(shape) - len(first.shape)]
@@ -249,20 +245,8 @@ def _value(page: tifffile.TiffPage, code: int) -> Any:
 # Writing
 
 
-def storage_of(path: Path) -> Table:
-    """Tiles and compression of a TIFF file as options of ``write_tiff``; zlib replaces a compression with loss."""
-    with readable_stack(path, "TIFF"), tifffile.TiffFile(path) as tif:
-        page = tif.pages.first
-        tiles = {"tile": (page.tilelength, page.tilewidth)} if page.is_tiled else {}
-        if page.compression not in _LOSSLESS:
-            return {**tiles, "compression": "zlib"}
-        return {**tiles, "compression": page.compression, "predictor": page.predictor}
-
-
-def write_tiff(
-    path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None, storage: Mapping[str, object] = {}
-) -> None:
-    """Write a TIFF file frame by frame; arguments as in ``StackFormat.write``, and from ``storage_of``."""
+def write_tiff(path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None) -> None:
+    """Write a TIFF file frame by frame; arguments as in ``StackFormat.write``."""
     # Three or four channels are stored last (RGB), others as planes of a page.
     colour = info.axes == "TCHW" and info.shape[1] in (3, 4)
     axes = "TYX" if info.axes == "THW" else "TYXS" if colour else "TSYX" if info.shape[1] > 1 else "TCYX"
@@ -275,7 +259,7 @@ def write_tiff(
         value = tag.value.encode() if isinstance(tag.value, str) else tag.value
         if tag.code not in (_DESCRIPTION, *_RESOLUTION):
             extratags.append((tag.code, tag.dtype, tag.count, value, tag.first_page))
-    options: Table = {"compression": compression, **storage, "extratags": extratags}
+    options: Table = {"compression": compression, "extratags": extratags}
     options["metadata"] = {**attributes_of(replace(info, orientation=1)), "axes": axes}
     options |= {"photometric": "rgb" if colour else "minisblack"} | ({"planarconfig": 2} if axes == "TSYX" else {})
     if _DESCRIPTION in tags:
@@ -285,8 +269,6 @@ def write_tiff(
         options |= {"resolution": (x, y), "resolutionunit": unit}
     shape = (info.shape[0], *info.shape[2:], info.shape[1]) if colour else info.shape
     pages = (np.ascontiguousarray(np.moveaxis(f, 0, -1) if colour else f, info.dtype) for f in frames)
-    if len(shape) == 4 and not colour and "tile" not in storage:
+    if len(shape) == 4 and not colour:
         pages = (plane for frame in pages for plane in frame)
-    # an iterator would have to yield the tiles
-    data = np.stack(list(pages)) if "tile" in storage else pages
-    tifffile.imwrite(path, data=data, maxworkers=1, shape=shape, dtype=info.dtype, **options)
+    tifffile.imwrite(path, data=pages, maxworkers=1, shape=shape, dtype=info.dtype, **options)

@@ -56,45 +56,30 @@ class Report:
 
 def headline(report: Report) -> tuple[str, str]:
     """Overall result: ``"good"``, ``"doubt"`` or ``"bad"``, which selects its colour, and its sentence."""
-    result, unchanged = report.detection, report.restored is None
-    totals: Table = {} if report.windows is None else report.windows.totals()
-    if result is None and unchanged:
-        return "doubt", "No vibration was found that can be removed; the frames are unchanged."
-    if result is None:
-        text = "The vibration changes; it was measured and removed by rsvib run."
-        return "good" if totals["outcomes"].get("helps") == totals["windows"] else "doubt", text
+    result, windows = report.detection, report.windows
+    totals: Table = {} if windows is None else windows.totals()
     outcome = "unknown" if report.verdict is None else report.verdict.overall
-    cases = (
-        (
-            unchanged and totals.get("restored"),
-            "doubt",
-            "Windows of the stack were restored before, see below; all frames together have no steady vibration that "
-            "can be removed, and are unchanged on this page.",
-        ),
-        (
-            unchanged and report.verdict is None,
-            "doubt",
-            "No vibration was detected that can be removed; the frames are unchanged.",
-        ),
-        (unchanged, "bad", "Restoration does not improve the frames; they are unchanged."),
-        (
-            outcome == "worse" or not bool(result.reliable.any()),
-            "bad",
-            "The detected vibration is not reliable; inspect the restored frames before you use them.",
-        ),
-        (
-            outcome == "unknown",
-            "doubt",
-            "The vibration was measured; these frames are not sufficient to determine whether restoration helps.",
-        ),
-        (
-            outcome == "helps" and bool(result.reliable.all()),
-            "good",
-            "The vibration of the camera was measured and removed; restoration improves the frames.",
-        ),
-        (True, "doubt", "The vibration was measured and removed in part."),
-    )
-    return next((mark, text) for holds, mark, text in cases if holds)
+    mark = "doubt"
+    if report.restored is None and totals.get("restored"):
+        text = "These frames are unchanged; other windows of the stack were restored, see below."
+    elif report.restored is None and report.verdict is None:
+        text = "No vibration was found that can be removed; the frames are unchanged."
+    elif report.restored is None:
+        mark, text = "bad", "Restoration does not improve the frames; they are unchanged."
+    elif result is None:
+        mark = "good" if totals["outcomes"].get("helps") == totals["windows"] else "doubt"
+        text = "The vibration changes; it was measured and removed by rsvib run."
+    elif outcome == "worse" or not bool(result.reliable.any()):
+        mark = "bad"
+        text = "The detected vibration is not reliable; inspect the restored frames before you use them."
+    elif outcome == "unknown":
+        text = "The vibration was measured; these frames are not sufficient to determine whether restoration helps."
+    elif outcome == "helps" and bool(result.reliable.all()):
+        mark = "good"
+        text = "The vibration of the camera was measured and removed; restoration improves the frames."
+    else:
+        text = "The vibration was measured and removed in part."
+    return mark, text
 
 
 # --- Frames ---

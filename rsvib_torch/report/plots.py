@@ -273,15 +273,6 @@ def windows_figure(
     return figure
 
 
-def _batch_figure(results: DetectionResult) -> Figure:
-    """Figure of a batch of detections: windows over time, stacks over their number."""
-    parts = [results[index] for index in range(results.batch_shape[0])]
-    starts = [float(part.offsets.times.min()) for part in parts]  # to a fraction of a row
-    if results.timing is not None and (np.diff(starts) > 0.5 * results.timing.frame_period).all():
-        return windows_figure(starts, parts)
-    return windows_figure(range(len(parts)), parts, time_label="number of the stack")
-
-
 @checks_arguments
 def motion_figure(motion: Motion, first: float = 0.0, last: float | None = None) -> Figure:
     """Draw the displacement of a motion along both axes over time.
@@ -562,20 +553,17 @@ def _rotation_figure(result: gyroscope.RotationAlignment) -> Figure:
 # of results on the CPU, without gradients
 FIGURES.update(
     {
-        (DetectionResult, 0): offset_figure,
-        (DetectionResult, 1): _batch_figure,
-        (detection.DisplacementSpectrum, 0): _spectrum_figure,
-        (detection.MotionDetection, 0): _detected_motion_figure,
-        (gyroscope.ClockAlignment, 0): lambda result: motion_figure(result.motion),
-        (gyroscope.RotationAlignment, 0): _rotation_figure,
-        (Vibration, 0): motion_figure,
-        (FreeMotion, 0): motion_figure,
-        (MtfCurve, 0): lambda curve: mtf_figure(
-            {f"MTF50 {measured_text(curve.mtf50, curve.mtf50_std)} cycles/px": [curve]}
-        ),
-        (OffsetCurve, 0): _measured_offsets_figure,
-        (RestorationVerdict, 0): _verdict_figure,
-        (StackManifest, 0): lambda manifest: windows_figure(
+        DetectionResult: offset_figure,
+        detection.DisplacementSpectrum: _spectrum_figure,
+        detection.MotionDetection: _detected_motion_figure,
+        gyroscope.ClockAlignment: lambda result: motion_figure(result.motion),
+        gyroscope.RotationAlignment: _rotation_figure,
+        Vibration: motion_figure,
+        FreeMotion: motion_figure,
+        MtfCurve: lambda curve: mtf_figure({f"MTF50 {measured_text(curve.mtf50, curve.mtf50_std)} cycles/px": [curve]}),
+        OffsetCurve: _measured_offsets_figure,
+        RestorationVerdict: _verdict_figure,
+        StackManifest: lambda manifest: windows_figure(
             [record.start_time for record in manifest.windows], [record.detection for record in manifest.windows]
         ),
     }

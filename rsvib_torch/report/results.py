@@ -4,21 +4,19 @@ import csv
 import math
 import os
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
 from rsvib_torch.checks.arguments import checks_arguments
-from rsvib_torch.checks.values import check_single, read_json
+from rsvib_torch.checks.values import check_single
 from rsvib_torch.detection import DetectionResult, MotionDetection
 from rsvib_torch.files.atomic import whole_file
 from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.results.presentation import Result, plain_values, result_of
+from rsvib_torch.results.presentation import Result, plain_values
 from rsvib_torch.stacks import RestoredFrames
-from rsvib_torch.text import quoted
 
 
 @checks_arguments
@@ -42,15 +40,8 @@ def read_vibration(path: str | os.PathLike[str], timing: SensorTiming | None = N
         >>> rsv.read_vibration(path, timing).vibration.frequency[:, 0].round().tolist()  # Hz
         [110.0, 90.0]
     """
-    data = read_json(Path(path), "vibration.json")
-    if data.get("format") != DetectionResult.file_format:
-        raise ValueError(
-            f"{path}: not a vibration.json, but a file of the format {quoted(data.get('format'))}; give the "
-            "vibration.json that rsvib detect or run wrote (rsvib run restores windows)"
-        )
-    result = result_of(DetectionResult, data, Path(path))
-    if result.batch_shape:
-        raise ValueError(f"{path}: a batch of detections; read it with DetectionResult.load, and pass one of them")
+    result = DetectionResult.load(path)
+    check_single(str(path), result.batch_shape)
     if timing is not None and result.timing is not None:
         check_same_timing(str(path), result.timing, timing)
     return result

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import check_fields, check_shapes, checked_methods, hints_of
-from rsvib_torch.checks.values import check_number, described, members_of, needed_package, read_json
+from rsvib_torch.checks.values import check_number, check_single, described, members_of, needed_package, read_json
 from rsvib_torch.files.atomic import write_json
 from rsvib_torch.files.reading import Table
 from rsvib_torch.results import IMPORTERS
@@ -32,22 +32,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 R = TypeVar("R")
-
-
-def result_of(kind: type[R], data: Table, path: Path) -> R:
-    """A result of a class from the content of a file that ``Result.save`` wrote, see ``Result.load``."""
-    file_format, found = getattr(kind, "file_format", ""), str(data.get("format"))
-    if found != file_format or data.get("version") != 1:
-        content = {"rsvib vibration": "DetectionResult", "rsvib stack": "StackManifest"}.get(found, found[6:])
-        reader = f", which {content}.load reads" if content[:1].isupper() and found != file_format else ""
-        raise ValueError(
-            f"{path}: expected format {file_format!r} of version 1, as {kind.__name__}.save writes it, got "
-            f"{quoted(found)} of version {quoted(data.get('version'))}{reader}"
-        )
-    try:
-        return decode(kind, data, "")
-    except (ValueError, RuntimeError, OverflowError) as error:  # of PyTorch and of conversions, for impossible values
-        raise ValueError(f"{path}: {str(error).partition(chr(10))[0]}") from error
 
 
 def _decoded(kind: object, value: object, path: str, missing: float) -> object:
@@ -114,8 +98,8 @@ def figure_png(figure: "Figure", dpi: int) -> bytes:
     return picture.getvalue()
 
 
-# The function that draws a result of this type with this number of leading dimensions (0: not a batch).
-FIGURES: "dict[tuple[type, int], Callable[..., Figure]]" = {}
+# The function that draws a result of this type, which is not a batch.
+FIGURES: "dict[type, Callable[..., Figure]]" = {}
 
 # Text
 
@@ -331,7 +315,15 @@ class Result(Summarised):
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
         """Read a file that ``save`` wrote."""
-        return result_of(cls, read_json(Path(path), f"file of {cls.__name__}.save"), Path(path))
+        data = read_json(Path(path), f"file of {cls.__name__}.save")
+        if (data.get("format"), data.get("version")) != (cls.file_format, 1):
+            got = f"{quoted(data.get('format'))} of version {quoted(data.get('version'))}"
+            expected = f"format {cls.file_format!r} of version 1, as {cls.__name__}.save writes it"
+            raise ValueError(f"{path}: expected {expected}, got {got}")
+        try:
+            return decode(cls, data, "")
+        except (ValueError, RuntimeError, OverflowError) as error:  # of PyTorch and of conversions of impossible values
+            raise ValueError(f"{path}: {str(error).partition(chr(10))[0]}") from error
 
     def table(self, *, pixel_size: float | None = None) -> dict[str, list[object]]:
         """The result as columns by name, with the unit in each name; None for unknown values.
@@ -369,25 +361,20 @@ class Result(Summarised):
 
     def plot(self, path: str | os.PathLike[str] | None = None) -> "Figure":
         """Draw the result, and write the picture (PNG, SVG, PDF) if a path is given; notebooks show the figure."""
-        draw = self._figure_function()
-        if draw is None:
-            drawn = sorted({kind.__name__ for kind, _ in FIGURES})
-            if type(self).__name__ in drawn:
-                shape = tuple(self.batch_shape)
-                raise ValueError(f"a batch of shape {shape} has no figure: select one, result[0].plot()")
-            raise TypeError(f"{type(self).__name__} has no figure; these have one: {', '.join(drawn)}")
-        figure = draw(self.mapped(lambda values: values.detach().cpu()))
+        figures = IMPORTERS["figures"]()  # adds to the table
+        if type(self) not in FIGURES:
+            drawn = ", ".join(sorted(kind.__name__ for kind in FIGURES))
+            raise TypeError(f"{type(self).__name__} has no figure; these have one: {drawn}")
+        check_single("result", self.batch_shape)
+        figure = FIGURES[type(self)](self.mapped(lambda values: values.detach().cpu()))
         if path is not None:
-            IMPORTERS["figures"]().save_figure(figure, path)
+            figures.save_figure(figure, path)
         return figure
-
-    def _figure_function(self) -> "Callable[..., Figure] | None":
-        IMPORTERS["figures"]()  # adds to the table
-        return FIGURES.get((type(self), len(self.batch_shape)))
 
     def _repr_html_(self) -> str:
         text = super()._repr_html_()
-        if self._figure_function() is None:
+        IMPORTERS["figures"]()
+        if type(self) not in FIGURES or self.batch_shape:
             return text
         return f'{text}<img src="{data_uri(figure_png(self.plot(), dpi=70), "image/png")}">'
 

@@ -72,11 +72,6 @@ class WindowResult(Summarised):
         """Whether the frames are restored."""
         return self.restoration is not None and self.restoration.restored
 
-    @property
-    def changed(self) -> dict[int, Tensor]:
-        """The restored frames by index."""
-        return dict(zip(self.indices, self.frames, strict=True)) if self.restored else {}
-
     def summary(self) -> str:
         """Frames of the window, its vibration, and what was restored."""
         state = "restored" if self.restored else "unchanged"
@@ -104,7 +99,6 @@ class StackJob:
     options: ProcessStackOptions
     # of every window, the motion to use instead of a detection, from its first frame on; None: it has none
     given: Sequence[DetectedVibration | FreeMotion | None] | None = None
-    is_recorded: bool = False  # whether ``given`` are parts of a recorded motion
 
     def open(self) -> FrameReader:
         """Open the stack, which must not have changed."""
@@ -185,7 +179,7 @@ class StackJob:
         rows = taken.shape[int(timing.scan_axis)]
         if self.given is not None:
             given = self.given[window.index]
-            if not isinstance(given, FreeMotion) or self.is_recorded:
+            if not isinstance(given, FreeMotion) or self.options.motion is not None:  # recorded
                 return given, given if isinstance(given, DetectedVibration) else None
             return given, tones_of_given(given, timing, len(taken), rows)
         detected = detect_vibration(taken, timing, **self.options.detection or {})
@@ -227,7 +221,8 @@ class StackJob:
         if result.restored and not result.indices:  # one image of all frames
             frames = list(counts(result.frames))
         else:
-            restored, written = result.changed, list(result.window.written)
+            restored = dict(zip(result.indices, result.frames, strict=True)) if result.restored else {}
+            written = list(result.window.written)
             written = [written[len(written) // 2]] if self.chosen.joint is True else written
             frames = [counts(restored[index]) if index in restored else as_taken(index) for index in written]
         return frames, self.record(result, len(frames))
@@ -287,6 +282,9 @@ def _given(
         raise ValueError("motion must be a FreeMotion; it has no detection and no given detections beside it")
     starts: list[float] = (timing.frame_starts(info.shape[0]) - timing.frame_starts(1)).tolist()
     readout = info.shape[int(timing.scan_axis)] * timing.row_time + timing.exposure_time
+    if motion.start > motion.spacing or motion.end < starts[-1] + readout - motion.spacing:
+        needed = f"the frames need 0 to {starts[-1] + readout:.6g} s"
+        raise ValueError(f"motion covers {motion.start:.6g} to {motion.end:.6g} s on the clock of the frames, {needed}")
     ends = [(starts[window.first], starts[window.last]) for window in windows]
     parts = [motion.within(first - readout, last + 2 * readout).retimed(first) for first, last in ends]
     return [part.to(options.device) for part in parts]
@@ -315,13 +313,13 @@ def plan_job(
     of_job = {"full_scale": full_scale, "device": device, "restoration": restoration, "progress": None}
     stated = ProcessStackOptions(**{**vars(options), **of_job})
     windows = cut_windows(info.shape[0], stated.window)
-    given = _given(stated, info, timing, windows)
-    job = StackJob(
-        Path(source), info, timing, replace(stated, given=None, motion=None), given, stated.motion is not None
-    )
+    job = StackJob(Path(source), info, timing, stated, _given(stated, info, timing, windows))
     if job.chosen.mosaic is not None:
         check_mosaic(job.chosen.mosaic, info.shape, str(source))
     check_optics(job.chosen.optics)
+    joint, most = job.chosen.joint, min(stated.window, info.shape[0])
+    if joint is not True and joint > most:
+        raise ValueError(f"joint must be at most {most}, the number of frames in a window (window), got {joint}")
     if options.workers is not None:
         most = options.workers
     elif on_gpu:

@@ -138,23 +138,6 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
             "bad_frames": self.bad_frames,
         }
 
-    def tone_table(self) -> tuple[list[str], list[list[str]]]:
-        """Head and rows of a table of the tones of each axis: median ± standard deviation over the windows.
-
-        If the vibration changes in windows, the amplitudes in the first and in the last one.
-        """
-        rows, count = [], len(self.windows)
-        for name, of_axis in self.totals()["tones"].items():
-            for tone in of_axis["tones"] or [{"windows": 0}]:
-                texts = [
-                    measured_text(tone[quantity], tone[f"{quantity}_spread"] or None) if tone["windows"] else ""
-                    for quantity in ("amplitude", "frequency")
-                ]
-                if self._changing and tone["windows"] > 1:
-                    texts[0] = f"{tone['first']:.4g} … {tone['last']:.4g}"
-                rows.append([name, f"{tone['windows']} of {count}", *texts])
-        return ["axis", "reliable windows", "amplitude (px)", "frequency (Hz)"], rows
-
     def lines(self) -> tuple[list[str], list[str]]:
         """The totals as lines of text: about the vibration, and about the restoration."""
         data = self.totals()
@@ -183,14 +166,28 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
         return vibration, restoration
 
     def _tone_lines(self) -> list[str]:
-        """The table of tones, and what its columns mean."""
-        spread, changing = "median ± standard deviation over the windows", self._changing
+        """A table of the tones of each axis over the windows, and what its columns mean.
+
+        If the vibration changes in windows, it has the amplitudes in the first and in the last one.
+        """
+        rows, count, changing = [], len(self.windows), self._changing
+        for name, of_axis in self.totals()["tones"].items():
+            for tone in of_axis["tones"]:
+                texts = [
+                    measured_text(tone[name], tone[f"{name}_spread"] or None) for name in ("amplitude", "frequency")
+                ]
+                if changing and tone["windows"] > 1:
+                    texts[0] = f"{tone['first']:.4g} … {tone['last']:.4g}"
+                rows.append([name, f"{tone['windows']} of {count}", *texts])
+            rows += [] if of_axis["tones"] else [[name, f"0 of {count}", "", ""]]
+        table = text_table(["axis", "reliable windows", "amplitude (px)", "frequency (Hz)"], rows)
+        spread = "median ± standard deviation over the windows"
         if not changing:
-            return [text_table(*self.tone_table()), spread]
-        which = "all" if changing == len(self.windows) else f"{changing} of {len(self.windows)}"
+            return [table, spread]
+        which = "all" if changing == count else f"{changing} of {count}"
         text = f"no steady tones explain {which} windows, whose motion was therefore measured without tones"
         return [
-            text_table(*self.tone_table()),
+            table,
             f"amplitude: in the first and the last window; frequency: {spread}",
             wrapped(f"{text}; amplitudes are those of a tone of the same rms displacement"),
         ]

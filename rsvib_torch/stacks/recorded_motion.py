@@ -19,7 +19,7 @@ from rsvib_torch.gyroscope.rotation_alignment import AlignOptions, RotationAlign
 from rsvib_torch.io.frame_times import timing_from_first_frame
 from rsvib_torch.io.full_scale import counts_to_frames
 from rsvib_torch.io.stack_info import StackInfo
-from rsvib_torch.io.stack_reading import open_stack
+from rsvib_torch.io.stack_reading import open_stack, read_frames
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
@@ -63,9 +63,7 @@ def part_of_stack(source: Path, info: StackInfo, timing: SensorTiming, part: sli
     check_stack_fits(info.with_frames(part.stop - part.start))
     starts = timing.frame_starts(info.shape[0])
     times = (starts[part] - starts[0]).tolist()
-    with closing(open_stack(source)) as reader:
-        frames = [reader.frame(index) for index in range(part.start, part.stop)]
-    images = counts_to_frames(np.stack(frames), info.full_scale, str(source), info.nodata)
+    images = read_frames(source, range(part.start, part.stop), info.full_scale)
     return images, replace(timing, frame_start_times=times)
 
 

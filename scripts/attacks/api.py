@@ -150,8 +150,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
         return Call(function, others | {name: value for name, value in known.items() if value is not inspect._empty})
 
     fast = {"method": "bands", "tones": 1}
-    new = {name: folder / name for name in ("new.npy", "new.mkv", "figure.png", "rates.gcsv", "maps")}
-    with_camera = vibration.with_camera(rsv.Camera(900.0))
+    new = {name: folder / name for name in ("new.npy", "new.mkv", "figure.png", "maps")}
     different: dict[str, dict[str, Any]] = {  # values that differ from the pool, by function
         "align_motion": {"camera": None},
         "calibrate_row_time": {"frames": stripes},
@@ -173,7 +172,6 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
         "simulate_frames": {"frame_size": (64, 48), "num_frames": 2, "generator": generator},
         "ssim": {"image": restored, "reference": frames},
         "windows_figure": {"times": [0.0]},
-        "write_gcsv": {"path": new["rates.gcsv"], "motion": with_camera, "num_frames": 2},
         "write_offsets": {"path": folder / "offsets.csv"},
         "write_stack": {"path": folder / "written.tif", "like": info},
         "write_table": {"path": folder / "tones.csv"},

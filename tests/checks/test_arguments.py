@@ -277,7 +277,7 @@ def test_pixels_beyond_all_scales(value):
         (lambda: detect(WIDE, columns=64), "at least 64 x 96 are needed; reduce search, or use more columns$"),
         (lambda: dewarped(2, 48, 64, 1), r"or frames.permute\(0, 3, 1, 2\), or channels=\"first\" if"),
         (lambda: dewarped(48, 64, 3, channels="last"), r"one image \(H, W, C\): pass frames\[None\] with"),
-        (lambda: dewarped(48, 64, 1), r"or channels=\"first\" if these are 48 frames of 64 x 1 px"),
+        (lambda: dewarped(48, 64, 1), r"or channels=\"first\" if they are \(T, H, W\)"),
         (lambda: dewarped(2, 3, 48, 64, channels="last"), r"before the image axes: omit channels=\"last\""),
         (lambda: dewarped(8, 2, 48, 64), r"appear to be a batch \(B, T, H, W\): pass frames\[:, :, None\]"),
         (lambda: dewarped(5, 7), r"got \(5, 7\); one grey image is frames\[None\]"),

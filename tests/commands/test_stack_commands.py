@@ -69,7 +69,8 @@ def test_run_of_a_long_stack(place, tmp_path, capsys):
 
 
 def test_files_that_are_no_vibration_are_refused(place, tmp_path, capsys):
-    for vibration, message in (("manifest.json", "rsvib run restores windows"), ("windows.png", "not a vib")):
+    expected = "expected format 'rsvib vibration' of version 1"
+    for vibration, message in (("manifest.json", expected), ("windows.png", "not a file of DetectionResult.save")):
         options = ("--config", place / "camera.toml", "--vibration", place / "out" / vibration)
         assert message in refused(capsys, "restore", place / "frames.tif", tmp_path / "o.tif", *options)
     assert not (tmp_path / "o.tif").exists()

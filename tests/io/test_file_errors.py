@@ -11,7 +11,7 @@ import torch
 from refusals import refuses
 
 from rsvib_torch.files.atomic import whole_file, whole_folder
-from rsvib_torch.io import check_stack_target, read_stack, read_stack_info, write_stack
+from rsvib_torch.io import read_stack, read_stack_info, write_stack
 
 FRAMES = torch.rand(3, 9, 7, generator=torch.Generator().manual_seed(1))
 
@@ -177,7 +177,7 @@ def test_paths_that_cannot_be_written(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.mkdtemp", refuse)
     for path in (tmp_path / "a.tif", tmp_path / "folder"):
         with pytest.raises(OSError, match=r"cannot write .* is not writable \(Permission denied\)"):
-            check_stack_target(path, (3, 9, 7), dtype="uint8")
+            write_stack(path, FRAMES, dtype="uint8")
 
 
 def test_permissions_of_a_replaced_file_are_kept(tmp_path):

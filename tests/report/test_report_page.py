@@ -158,7 +158,7 @@ def test_kernels_are_centred_on_their_rows(motion):
         ((True, True), verdict_of("unknown", Reason("nothing_undone")), True, "doubt", "not sufficient to determine"),
         ((True, True), None, True, "doubt", "not sufficient to determine whether"),
         ((True, True), verdict_of("worse", Reason("no_contrast", "x")), False, "bad", "does not improve the frames"),
-        ((False, False), None, False, "doubt", "No vibration was detected that can be removed"),
+        ((False, False), None, False, "doubt", "No vibration was found that can be removed"),
         ((False, False), verdict_of("helps"), True, "bad", "not reliable"),
     ],
 )

@@ -1,7 +1,6 @@
 """``restore``: accepted input, options, axes that are not restored, missing and saturated pixels, warnings."""
 
 import math
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 
@@ -254,22 +253,6 @@ def test_strips_of_a_frame_are_solved_together_as_one_by_one():
     one_by_one = restore(frames.clone().requires_grad_(), timing, vibration, check=False)  # differentiable
     torch.testing.assert_close(together, one_by_one.detach(), atol=1e-4, rtol=0)
     assert (together - frames).abs().amax() > 0.1
-
-
-@pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
-@pytest.mark.parametrize("method", ["exact", "dewarp"])
-def test_transforms_that_are_not_supported_are_refused_in_one_line(method):
-    frames = torch.rand(2, 64, 64, generator=torch.Generator().manual_seed(0))
-    timing = rsv.SensorTiming(1e-4, 4, 100)
-    vibration = rsv.Vibration((1.5, 1.2), (90.0, 120.0))
-
-    def restored(frames):
-        return rsv.restore(frames, timing, vibration, method=method, check=False)
-
-    with pytest.raises(TypeError, match=r"restore does not support this transform of torch.func: use"):
-        torch.func.vmap(restored)(frames[None])
-    with suppress(TypeError):  # some methods have it
-        assert torch.func.jvp(restored, (frames,), (frames,))[1].shape == frames.shape
 
 
 @pytest.mark.parametrize("method", ["exact", "banded", "richardson-lucy"])

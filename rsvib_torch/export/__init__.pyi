@@ -1,1 +1,0 @@
-from .angular_rates import write_gcsv as write_gcsv
