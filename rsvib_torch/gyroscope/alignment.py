@@ -1,43 +1,31 @@
-"""A motion that another instrument recorded: alignment with the clock of the frames.
+"""A motion that another instrument recorded: alignment with the clock of the frames."""
 
-Invariant: the displacement depends on the row only (docs/architecture.md).
-"""
-
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ParamSpec, Protocol, overload
 
-import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from rsvib_torch.checks.arguments import FramesOrFiles
 from rsvib_torch.checks.values import check_single
-from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.rows.grouped_frames import grouped_frames
-from rsvib_torch.detection.shapes.free import record_of, residual_of_motion, rms_motion, start_of_stack
-from rsvib_torch.detection.verdict import recording_reasons
 from rsvib_torch.execution.parallel import full_precision, without_gradients
 from rsvib_torch.frames.entry_points import entry_point
-from rsvib_torch.frames.prepare import (
-    frames_from_row_order,
-    grey_frames,
-    magnitudes_from_row_order,
-    offsets_from_row_order,
-    reasons_from_row_order,
-)
-from rsvib_torch.gyroscope.corner_tracks import corner_tracks
+from rsvib_torch.frames.prepare import frames_from_row_order, grey_frames
+from rsvib_torch.gyroscope.corner_tracks import CornerTracks, corner_tracks
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
-from rsvib_torch.gyroscope.rotation_alignment import AlignOptions, RotationAlignment, align_rates, offset_range, outside
+from rsvib_torch.gyroscope.rotation_alignment import AlignOptions, RotationAlignment, align_rates
+from rsvib_torch.gyroscope.rotation_fit import image_components
+from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.numerics.tables import Array, scaled_inverse, table, tensor
 from rsvib_torch.results.presentation import JudgedResult
 from rsvib_torch.results.reason import Reason
 from rsvib_torch.text import measured_text, wrapped
 
 P = ParamSpec("P")
+_DISTANT = Camera(1e6)  # of a motion in px without a camera: all columns are displaced alike
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -55,7 +43,8 @@ class ClockAlignment(
         scale: Seconds on the recording's clock per second of the frames.
         scale_std: Its standard deviation; 0 if it was not fitted.
         drift: (2,) px/s that the recording does not contain, as gyroscopes drift.
-        unexplained: (2,) px, rms displacement of rows that the aligned motion does not explain, beyond their noise.
+        unexplained: (2,) px, standard deviation of the motion from frame to frame that the recording does not explain,
+            beyond the noise of the measurements.
         reliable: Whether the recording explains the measurements, at this offset only.
         findings: Each ``Reason`` why not; ``reasons`` has their texts.
     """
@@ -83,28 +72,6 @@ class ClockAlignment(
         return "\n".join([*clock, *axes, wrapped(verdict)])
 
 
-@dataclass(frozen=True)
-class FittedClock:
-    """Parameters of the fit; ``at`` is the reading of the recording's clock at time ``middle`` of the frames."""
-
-    at: float
-    scale: float
-    drift: tuple[float, float]
-    middle: float
-
-    @property
-    def offset(self) -> float:
-        """Reading of the recording's clock at time 0 of the frames, in seconds."""
-        return self.at - self.scale * self.middle
-
-    def motion(self, recorded: FreeMotion) -> FreeMotion:
-        """The recorded motion on the clock of the frames."""
-        moved = recorded.retimed(self.offset, self.scale)
-        knots = moved.knots - self.middle
-        drift = knots.new_tensor(self.drift)[:, None] * knots
-        return FreeMotion(moved.coefficients + drift, moved.start, moved.spacing, moved.tones, moved.camera)
-
-
 class _AlignsMotion(Protocol[P]):
     """Type of ``align_motion``."""
 
@@ -130,15 +97,14 @@ def align_motion(
 ) -> ClockAlignment | RotationAlignment:
     """Find offset and scale between the clock of a recorded motion and that of the frames.
 
-    The recording (of a gyroscope, of attitude sensors) is compared with the displacements of the rows between frames:
-    first at many offsets with those of row bands, then by least squares with those measured on the images around it. A
-    uniform drift of each axis is fitted as well.
-
-    **Angular rates** (``read_gyroscope``). Corners are followed between consecutive frames, and compared with the
-    rotation of the camera between the exposures of their rows, for all 24 assignments of the axes and all offsets.
+    Corners are followed between consecutive frames, and compared with the rotation of the camera between the exposures
+    of their rows, at all offsets and, of **angular rates** (``read_gyroscope``), for all 24 assignments of the axes.
     Bias, clock and, without a camera, the focal length are fitted. Robust weights exclude what moves by itself or is
     fixed to the camera. Every pair of frames has a translation of its own: if the scene has parallax, only
     displacements across its lines (epipolar lines) determine the rotation.
+
+    A **motion in px** is compared as the rotation of a distant camera, with its own axes and without a focal length;
+    its bias is the drift.
 
     Args:
         frames: Stack (T, H, W) or (T, C, H, W) of at least two frames; tensor, array, list of these, or files; NaN
@@ -182,107 +148,38 @@ def align_motion(
     timing = stack.timing
     if stack.batched:
         raise ValueError(f"align_motion takes one stack, got a batch of {len(stack.images)}")
-    grey = stack.images
+    images = frames_from_row_order(stack.images[0], timing)
+    masks = [None] * len(images) if stack.valid is None else frames_from_row_order(stack.valid[0], timing)
+    starts = timing.in_row_order().frame_starts(len(images)).tolist()
+    tracks = corner_tracks(zip(range(len(images)), images, masks, strict=True), starts, timing)
+    return align_tracks(tracks, timing, recorded, options)
+
+
+def align_tracks(
+    tracks: CornerTracks, timing: SensorTiming, recorded: FreeMotion | AngularRates, options: AlignOptions
+) -> ClockAlignment | RotationAlignment:
+    """``align_motion`` from the corners of pairs of frames."""
     if isinstance(recorded, AngularRates):
-        images = frames_from_row_order(grey[0], timing)
-        masks = [None] * len(images) if stack.valid is None else frames_from_row_order(stack.valid[0], timing)
-        starts = timing.in_row_order().frame_starts(len(images)).tolist()
-        tracks = corner_tracks(zip(range(len(images)), images, masks, strict=True), starts, timing)
         return align_rates(tracks, timing, recorded, options)
-    rowwise, start = start_of_stack(stack, timing, options)
-    measured, (first, last) = start.measurements, record_of(stack, rowwise)
-    turned = recorded.to_row_order(timing).to("cpu")
-    low, high = offset_range(turned.start, turned.end, first, last, options.offsets)
-    offset, other = best_offset(measured, turned, low, high, rowwise)
-    clock = FittedClock(offset + 0.5 * (first + last), 1.0, (0.0, 0.0), 0.5 * (first + last))
-    clock, _ = fit_clock(measured, turned, clock, False)
-    weighed = measured.reweighted(residual_of_motion(measured, clock.motion(turned)))
-    clock, covariance = fit_clock(weighed, turned, clock, options.fit_scale)
-    rows = grouped_frames(grey, stack.valid, rowwise, clock.motion(turned).expanded(1).to(grey.device))
-    for _ in range(3):
-        moved = clock.motion(turned).expanded(1).to(grey.device)
-        measured = rows.measure(moved, keep_images=False).measurements
-        weighed = measured.reweighted(residual_of_motion(measured, clock.motion(turned)))
-        clock, covariance = fit_clock(weighed, turned, clock, options.fit_scale)
-    aligned = clock.motion(turned)
-    residual = residual_of_motion(measured, aligned)
-    covariance = covariance / measured.independent_fraction(residual)
-    std = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
-    gradient = np.array([1.0, -clock.middle])  # offset = at - scale * middle
-    offset_std = float(np.sqrt(np.maximum(gradient @ covariance[:2, :2] @ gradient, 0.0)))
-    rest = measured.unexplained(residual)[0]
-    reasons = recording_reasons(rms_motion(measured, aligned).tolist(), rest.tolist(), other)
-    reasons += outside(clock.offset, offset_std, options.offsets)
-    drift = offsets_from_row_order(torch.tensor(clock.drift, dtype=torch.float64, device="cpu"), timing)
-    in_image = replace(clock, drift=(float(drift[0]), float(drift[1])))
-    return ClockAlignment(
-        motion=in_image.motion(recorded),
-        offset=clock.offset,
-        offset_std=offset_std,
-        scale=clock.scale,
-        scale_std=float(std[1]),
-        drift=drift,
-        unexplained=magnitudes_from_row_order(tensor(rest), timing).to(grey.device),
-        reliable=not reasons,
-        findings=reasons_from_row_order(reasons, timing),
+    # The motion as the rotation of a camera; its rates are splines of twice as many knots.
+    camera, motion = recorded.camera or _DISTANT, recorded.to("cpu")
+    times = torch.arange(motion.start, motion.end, 0.5 * motion.spacing, dtype=torch.float64, device="cpu")
+    rates = AngularRates(times, camera.attitude(motion.velocity(times)))
+    found = align_rates(tracks, timing, rates, replace(options, camera=camera), ("XYZ",))
+    # The motion in px, with the bias as a drift from the middle of the frames on.
+    drift = image_components(-found.scale * found.bias, camera.focal_length)[: motion.num_axes]
+    moved = motion.retimed(found.offset, found.scale)
+    drifted = functional.pad(drift, (0, motion.num_axes - len(drift)))[:, None] * (
+        moved.knots - found.times[[0, -1]].mean()
     )
-
-
-def best_offset(
-    measured: Measurements, recorded: FreeMotion, low: float, high: float, timing: SensorTiming
-) -> tuple[float, float | None]:
-    """The offset of the least residual, with a free drift, and another local minimum below twice the least square."""
-    every = max(1, measured.exposure_starts.shape[1] // 400)  # 400 scene rows are enough for a start
-    rows = measured.of_rows(np.flatnonzero((measured.weights[0] > 0).all(-1))[::every])
-    starts = rows.exposure_starts + 0.5 * rows.exposure_time
-    weight = rows.weights[:, :, None] * rows.visible[..., None]
-    drift = rows.relative(np.repeat(starts[..., None], 2, -1))
-    norm = (weight * np.square(drift)).sum((1, 2)).clip(min=1e-300)
-    step = max(0.5 * recorded.spacing, 4 * timing.row_time, (high - low) / 20000)  # at most 20,000 offsets
-    grid = np.linspace(low, high, max(2, math.ceil((high - low) / step) + 1))
-    costs = []
-    for part in np.split(grid, range(128, len(grid), 128)):  # (128, N, G, 2) values at a time
-        moved = table(recorded.displacement(tensor(part[:, None, None] + starts)))
-        residual = rows.displacements * rows.visible[..., None] - rows.relative(moved)
-        along = (weight * drift * residual).sum((1, 2)) / norm
-        # both axes together, as one of them may be at rest; without the largest fifth: clouds
-        size = (weight * np.square(residual - along[:, None, None] * drift)).sum(-1).reshape(len(part), -1)
-        costs.append(np.sort(size)[:, : math.ceil(0.8 * size.shape[-1])].sum(-1))
-    cost = np.concatenate(costs)
-    best, padded = int(cost.argmin()), np.pad(cost, 1, constant_values=math.inf)
-    valleys = (cost <= padded[:-2]) & (cost <= padded[2:]) & (cost < 2.0 * cost[best] + 1e-300)
-    valleys[best] = False
-    others = np.flatnonzero(valleys)
-    return float(grid[best]), float(grid[others[cost[others].argmin()]]) if len(others) else None
-
-
-def fit_clock(
-    measured: Measurements, recorded: FreeMotion, clock: FittedClock, fit_scale: bool
-) -> tuple[FittedClock, Array]:
-    """Gauss-Newton on clock reading, scale and drift, from start values; also their covariance (4, 4)."""
-    starts = measured.exposure_starts
-    free = np.array([True, fit_scale, True, True])
-    for _ in range(12):
-        # 1. Velocity of the recording at the measured rows.
-        middle = starts + 0.5 * measured.exposure_time - clock.middle
-        in_time = recorded.retimed(clock.offset, clock.scale)
-        speed = table(in_time.velocity(tensor(starts + 0.5 * measured.exposure_time))) / clock.scale
-        # 2. Derivatives (1, N, G, 2, 4) of the displacements by the parameters.
-        x, y = np.eye(2)
-        middle = middle[..., None]
-        columns = [speed, speed * middle, middle * x, middle * y]
-        jacobian = measured.relative(np.stack(columns, -1)) * free
-        # 3. The normal equations and the step.
-        residual = residual_of_motion(measured, clock.motion(recorded))
-        weighted = np.einsum("bnac,bngcq->bngaq", measured.information, jacobian)
-        gram = np.einsum("bngap,bngaq->pq", jacobian, weighted)
-        right = np.einsum("bngap,bnga->p", weighted, residual)
-        inverse = scaled_inverse(gram)
-        change = inverse @ right
-        known = max(float(measured.num_measurements.sum()), 8.0) - free.sum()
-        covariance = inverse * (measured.square(residual).sum() / known)
-        at, speed_of_clock, *drift = (np.array([clock.at, clock.scale, *clock.drift]) + change).tolist()
-        clock = FittedClock(at, max(speed_of_clock, 0.1 * clock.scale), (drift[0], drift[1]), clock.middle)
-        if (np.abs(change) <= 1e-3 * np.sqrt(np.maximum(covariance.diagonal(), 0.0))).all():
-            break
-    return clock, covariance
+    return ClockAlignment(
+        motion=FreeMotion(moved.coefficients + drifted, moved.start, moved.spacing, moved.tones, moved.camera),
+        offset=found.offset,
+        offset_std=found.offset_std,
+        scale=found.scale,
+        scale_std=found.scale_std,
+        drift=drift[:2],
+        unexplained=found.unexplained[:2],
+        reliable=found.reliable,
+        findings=found.findings,
+    )

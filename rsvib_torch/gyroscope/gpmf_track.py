@@ -58,7 +58,7 @@ class CameraTrack:
     @classmethod
     def of(cls, packets: list[_Packet]) -> "CameraTrack":
         """The statements of all packets."""
-        times, exposures, turned = [_NONE.ravel()], [_NONE.ravel()], 0.0
+        times, exposures, turned = list[Array]([_NONE.ravel()]), list[Array]([_NONE.ravel()]), 0.0
         for packet in packets:
             for stream in packet.streams:
                 shutter, quaternions = stream.get(b"SHUT", _NONE).ravel(), stream.get(b"IORI", _NONE)

@@ -1,6 +1,7 @@
 """Alignment of the angular rates of a gyroscope with frames: clock, axes, bias, focal length, row time."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -13,11 +14,11 @@ from rsvib_torch.detection.verdict import recording_reasons
 from rsvib_torch.gyroscope.corner_tracks import CornerTracks
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, orientation_matrix
 from rsvib_torch.gyroscope.rotation_fit import RotationFit, RotationModel, fit_robustly, image_components
-from rsvib_torch.gyroscope.rotation_search import Start, search_orientations
+from rsvib_torch.gyroscope.rotation_search import ORIENTATIONS, Start, search_orientations
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.options import OffsetOptions
+from rsvib_torch.options import MaskedInputOptions
 from rsvib_torch.results.presentation import JudgedResult
 from rsvib_torch.results.reason import Reason
 from rsvib_torch.text import measured_text, text_table, wrapped
@@ -164,8 +165,8 @@ def outside(offset: float, std: float, limits: tuple[float, float] | None) -> li
 
 
 @option_group
-class AlignOptions(OffsetOptions):
-    """Options of ``align_motion``; bands are those of the start, and not used for angular rates."""
+class AlignOptions(MaskedInputOptions):
+    """Options of ``align_motion``."""
 
     camera: Camera | None = Field(
         default=None, description="Focal length and lens, for angular rates; by default the focal length is fitted."
@@ -184,9 +185,13 @@ class AlignOptions(OffsetOptions):
 
 
 def align_rates(
-    tracks: CornerTracks, timing: SensorTiming, rates: AngularRates, options: AlignOptions
+    tracks: CornerTracks,
+    timing: SensorTiming,
+    rates: AngularRates,
+    options: AlignOptions,
+    orientations: Sequence[str] = ORIENTATIONS,
 ) -> RotationAlignment:
-    """``align_motion`` for angular rates, from the corners of pairs of frames."""
+    """``align_motion`` for angular rates, from the corners of pairs of frames, with one of the ``orientations``."""
     camera, offsets = options.camera, options.offsets
     if camera is not None:
         camera.check_size(tracks.size[1], tracks.size[0])
@@ -202,7 +207,7 @@ def align_rates(
         return torch.tensor(values, dtype=torch.float64)
 
     # 1. Axes and offsets that explain the displacements best, and the fit from there with the smallest residuals.
-    search = search_orientations(tracks, tracks.roughly(), rates, timing.row_time, limits, camera)
+    search = search_orientations(tracks, tracks.roughly(), rates, timing.row_time, limits, camera, orientations)
     lens = camera or Camera(search.starts[0].focal_length)
     first = search.starts[0]
     model = RotationModel(tracks, rates, first.orientation, lens, middle, free)
@@ -211,7 +216,7 @@ def align_rates(
     # 2. What does not follow the gyroscope has no weight in a second search, and parallax little.
     row_time = float(fit.parameters[6])
     lens = replace(lens, focal_length=float(fit.parameters[5]))
-    again = search_orientations(tracks, fit.information(), rates, row_time, limits, lens)
+    again = search_orientations(tracks, fit.information(), rates, row_time, limits, lens, orientations)
     best = again.starts[0]
     if best.orientation != first.orientation or abs(best.offset - first.offset) > 5 / rates.sample_rate:
         model = replace(model, orientation=best.orientation)
@@ -250,7 +255,8 @@ def _result(
     first, last = float(middles[0, 0]) - 0.5 * rows * row_time, float(middles[-1, 1]) + 0.5 * rows * row_time
     clock = scale * (torch.tensor([first, last], dtype=torch.float64) - model.middle) + at
 
-    moved = (predicted - predicted.mean(0)).square().mean(0).sqrt()
+    moved = model.components(fit.parameters, model.tracks.times(row_time))  # of the rows of the corners
+    moved = (moved - moved.mean(0)).square().mean(0).sqrt()
     reasons = recording_reasons(moved[:2].tolist(), unexplained[:2].tolist(), other)
     reasons += ambiguous + _uncertain(fit, std) + outside(offset, offset_std, offsets)
     steps = model.rates.times.diff()
