@@ -66,7 +66,7 @@ FUNCTIONS = {
     "detect_motion": (free, 1e-3, True),
     "tracker": (tracked, 1e-4, False),
     "judge_restoration": (judged, 1e-3, False),
-    "align_motion": (aligned, 1e-3, False),
+    "align_motion": (aligned, 2e-2, False),  # px; the cells of corners are others
     "RollingShutterVibration": (augmented, 1e-4, False),
     "restore, exact": (restored, 1e-4, True),
     "restore, banded": (partial(restored, method="banded"), 1e-4, True),

@@ -108,7 +108,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     augmentation = rsv.RollingShutterVibration(timing, **random_tones)
     detector = rsv.VibrationDetector(timing, **DETECTION)
     restorer = rsv.VibrationRestorer(timing, method="dewarp", check=False)
-    alignment = rsv.align_motion(frames, timing, recorded, offsets=(-0.001, 0.001), **BANDS)
+    alignment = rsv.align_motion(frames, timing, recorded, offsets=(-0.001, 0.001))
     verdict = rsv.judge_restoration(frames, restored, timing, vibration)
     optics, sensor_noise = rsv.Optics(0.5, 0.4, 1.0), rsv.SensorNoise(5000.0, 0.01, 12, 0.01, 0.01, 0.01, 3)
     calibration = rsv.RowTimeCalibration(1e-4, 1e-6, 12.0, 0.3, 1000.0, 104.0, "forward", ())
