@@ -207,17 +207,20 @@ def align_rates(
         return torch.tensor(values, dtype=torch.float64)
 
     # 1. Axes and offsets that explain the displacements best, and the fit from there with the smallest residuals.
-    search = search_orientations(tracks, tracks.roughly(), rates, timing.row_time, limits, camera, orientations)
-    lens = camera or Camera(search.starts[0].focal_length)
-    first = search.starts[0]
+    (first, *_), _, _ = search_orientations(
+        tracks, tracks.roughly(), rates, timing.row_time, limits, camera, orientations
+    )
+    lens = camera or Camera(first.focal_length)
     model = RotationModel(tracks, rates, first.orientation, lens, middle, free)
     fit = fit_robustly(model, parameters(first, timing.row_time))
 
     # 2. What does not follow the gyroscope has no weight in a second search, and parallax little.
     row_time = float(fit.parameters[6])
     lens = replace(lens, focal_length=float(fit.parameters[5]))
-    again = search_orientations(tracks, fit.information(), rates, row_time, limits, lens, orientations)
-    best = again.starts[0]
+    starts, other_offsets, mirrored = search_orientations(
+        tracks, fit.information(), rates, row_time, limits, lens, orientations
+    )
+    best = starts[0]
     if best.orientation != first.orientation or abs(best.offset - first.offset) > 5 / rates.sample_rate:
         model = replace(model, orientation=best.orientation)
         fit = fit_robustly(model, parameters(best, timing.row_time))
@@ -227,12 +230,12 @@ def align_rates(
         near = start.cost < _MAX_COST * best.cost
         return near and fit.significance(start.orientation, parameters(start, row_time)) < _CERTAIN
 
-    others = [start for start in again.starts if start.orientation != fit.model.orientation][:_MOST_OTHERS]
+    others = [start for start in starts if start.orientation != fit.model.orientation][:_MOST_OTHERS]
     axes = [start.orientation for start in others if explains(start)]
-    other = next((start.offset for start in again.other_offsets[:_MOST_OTHERS] if explains(start)), None)
+    other = next((start.offset for start in other_offsets[:_MOST_OTHERS] if explains(start)), None)
     ambiguous: list[Reason] = []
-    if again.mirrored is not None:
-        ambiguous.append(Reason("axes_mirrored", details={"axes": again.mirrored}))
+    if mirrored is not None:
+        ambiguous.append(Reason("axes_mirrored", details={"axes": mirrored}))
     if axes:
         ambiguous.append(Reason("axes_ambiguous", details={"axes": ", ".join(axes)}))
     return _result(fit, ambiguous, other, rows, offsets)

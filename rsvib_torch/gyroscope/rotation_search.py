@@ -41,15 +41,6 @@ class Start:
     cost: float  # weighted sum of squares
 
 
-@dataclass(frozen=True)
-class OrientationSearch:
-    """Start values with the least sums of squares."""
-
-    starts: tuple[Start, ...]  # one for each rotation of the axes, best first
-    other_offsets: tuple[Start, ...]  # other local minima of the best orientation, best first
-    mirrored: str | None  # a mirrored orientation with less than half of the least sum of squares
-
-
 def search_orientations(
     tracks: CornerTracks,
     information: Tensor,
@@ -58,8 +49,11 @@ def search_orientations(
     limits: tuple[float, float],
     camera: Camera | None,
     orientations: Sequence[str],
-) -> OrientationSearch:
-    """Compare corners, with information matrices (M, 2, 2) in px^-2, at offsets within ``limits`` in s.
+) -> tuple[list[Start], list[Start], str | None]:
+    """Start values of every rotation of the axes, and at other offsets (local minima) of the best one; the best first.
+
+    Also returns mirrored axes with less than half of the least sum of squares, None without. Corners with information
+    matrices (M, 2, 2) in px^-2 are compared at offsets within ``limits`` in s.
 
     The focal length is that of the camera, or is fitted if there is none. Mirrored axes are compared if there is more
     than one of the ``orientations``.
@@ -134,6 +128,4 @@ def search_orientations(
     cost = torch.nn.functional.pad(costs[starts[0].orientation][0], (1, 1), value=math.inf)
     valleys = ((cost[1:-1] <= cost[:-2]) & (cost[1:-1] <= cost[2:])).nonzero()[:, 0].tolist()
     others = sorted((start_at(starts[0].orientation, index) for index in valleys), key=lambda start: start.cost)[1:]
-    return OrientationSearch(
-        tuple(starts), tuple(others), min(mirrored, key=lambda name: best[name].cost, default=None)
-    )
+    return starts, others, min(mirrored, key=lambda name: best[name].cost, default=None)

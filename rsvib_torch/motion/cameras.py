@@ -107,20 +107,9 @@ def _modes() -> tuple[CameraMode, ...]:
     lines = csv.reader(line for line in text.splitlines() if not line.startswith("#"))
     next(lines)  # names of the columns
     return tuple(
-        CameraMode(
-            brand=brand,
-            model=model,
-            lens=lens,
-            width=int(width),
-            height=int(height),
-            frame_rate=float(rate),
-            readout_time=1e-3 * float(readout_ms),
-            readout_time_std=1e-3 * float(spread_ms),
-            calibrations=int(entries),
-            readout_direction=direction,
-            measured_rows=int(height),
-        )
-        for brand, model, lens, width, height, rate, readout_ms, spread_ms, entries, direction in lines
+        CameraMode(*names, int(width), rows, float(rate), 1e-3 * float(ms), 1e-3 * float(std_ms), int(count), way, rows)
+        for *names, width, height, rate, ms, std_ms, count, way in lines
+        for rows in [int(height)]
     )
 
 
