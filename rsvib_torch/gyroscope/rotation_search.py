@@ -48,7 +48,7 @@ def search_orientations(
     row_time: float,
     limits: tuple[float, float],
     camera: Camera | None,
-    orientations: Sequence[str],
+    orientations: Sequence[str] = ORIENTATIONS,
 ) -> tuple[list[Start], list[Start], str | None]:
     """Start values of every rotation of the axes, and at other offsets (local minima) of the best one; the best first.
 
