@@ -107,8 +107,12 @@ def _modes() -> tuple[CameraMode, ...]:
     lines = csv.reader(line for line in text.splitlines() if not line.startswith("#"))
     next(lines)  # names of the columns
     return tuple(
-        CameraMode(*names, int(width), rows, float(rate), 1e-3 * float(ms), 1e-3 * float(std_ms), int(count), way, rows)
-        for *names, width, height, rate, ms, std_ms, count, way in lines
+        CameraMode(
+            *(brand, model, lens, int(width), rows, float(rate), 1e-3 * float(ms), 1e-3 * float(std_ms), int(count)),
+            readout_direction=direction,
+            measured_rows=rows,
+        )
+        for brand, model, lens, width, height, rate, ms, std_ms, count, direction in lines
         for rows in [int(height)]
     )
 
