@@ -108,12 +108,19 @@ def _modes() -> tuple[CameraMode, ...]:
     next(lines)  # names of the columns
     return tuple(
         CameraMode(
-            *(brand, model, lens, int(width), rows, float(rate), 1e-3 * float(ms), 1e-3 * float(std_ms), int(count)),
+            brand=brand,
+            model=model,
+            lens=lens,
+            width=int(width),
+            height=int(height),
+            frame_rate=float(rate),
+            readout_time=1e-3 * float(readout_ms),
+            readout_time_std=1e-3 * float(spread_ms),
+            calibrations=int(entries),
             readout_direction=direction,
-            measured_rows=rows,
+            measured_rows=int(height),
         )
-        for brand, model, lens, width, height, rate, ms, std_ms, count, direction in lines
-        for rows in [int(height)]
+        for brand, model, lens, width, height, rate, readout_ms, spread_ms, entries, direction in lines
     )
 
 
