@@ -152,7 +152,8 @@ def align_motion(
     masks = [None] * len(images) if stack.valid is None else frames_from_row_order(stack.valid[0], timing)
     starts = timing.in_row_order().frame_starts(len(images)).tolist()
     tracks = corner_tracks(zip(range(len(images)), images, masks, strict=True), starts, timing)
-    return align_tracks(tracks, timing, recorded, options)
+    with torch.device("cpu"):  # also where another device is the default of PyTorch
+        return align_tracks(tracks, timing, recorded, options)
 
 
 def align_tracks(
