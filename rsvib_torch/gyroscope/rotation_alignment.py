@@ -1,7 +1,6 @@
 """Alignment of the angular rates of a gyroscope with frames: clock, axes, bias, focal length, row time."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -14,7 +13,7 @@ from rsvib_torch.detection.verdict import recording_reasons
 from rsvib_torch.gyroscope.corner_tracks import CornerTracks
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, orientation_matrix
 from rsvib_torch.gyroscope.rotation_fit import RotationFit, RotationModel, fit_robustly, image_components
-from rsvib_torch.gyroscope.rotation_search import ORIENTATIONS, Start, search_orientations
+from rsvib_torch.gyroscope.rotation_search import Start, search_orientations
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
@@ -185,13 +184,9 @@ class AlignOptions(MaskedInputOptions):
 
 
 def align_rates(
-    tracks: CornerTracks,
-    timing: SensorTiming,
-    rates: AngularRates,
-    options: AlignOptions,
-    orientations: Sequence[str] = ORIENTATIONS,
+    tracks: CornerTracks, timing: SensorTiming, rates: AngularRates, options: AlignOptions
 ) -> RotationAlignment:
-    """``align_motion`` for angular rates, from the corners of pairs of frames, with one of the ``orientations``."""
+    """``align_motion`` from the corners of pairs of frames."""
     camera, offsets = options.camera, options.offsets
     if camera is not None:
         camera.check_size(tracks.size[1], tracks.size[0])
@@ -207,9 +202,7 @@ def align_rates(
         return torch.tensor(values, dtype=torch.float64)
 
     # 1. Axes and offsets that explain the displacements best, and the fit from there with the smallest residuals.
-    (first, *_), _, _ = search_orientations(
-        tracks, tracks.roughly(), rates, timing.row_time, limits, camera, orientations
-    )
+    (first, *_), _, _ = search_orientations(tracks, tracks.roughly(), rates, timing.row_time, limits, camera)
     lens = camera or Camera(first.focal_length)
     model = RotationModel(tracks, rates, first.orientation, lens, middle, free)
     fit = fit_robustly(model, parameters(first, timing.row_time))
@@ -217,9 +210,7 @@ def align_rates(
     # 2. What does not follow the gyroscope has no weight in a second search, and parallax little.
     row_time = float(fit.parameters[6])
     lens = replace(lens, focal_length=float(fit.parameters[5]))
-    starts, other_offsets, mirrored = search_orientations(
-        tracks, fit.information(), rates, row_time, limits, lens, orientations
-    )
+    starts, other_offsets, mirrored = search_orientations(tracks, fit.information(), rates, row_time, limits, lens)
     best = starts[0]
     if best.orientation != first.orientation or abs(best.offset - first.offset) > 5 / rates.sample_rate:
         model = replace(model, orientation=best.orientation)

@@ -7,7 +7,6 @@ form.
 
 import itertools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,15 +47,13 @@ def search_orientations(
     row_time: float,
     limits: tuple[float, float],
     camera: Camera | None,
-    orientations: Sequence[str] = ORIENTATIONS,
 ) -> tuple[list[Start], list[Start], str | None]:
     """Start values of every rotation of the axes, and at other offsets (local minima) of the best one; the best first.
 
     Also returns mirrored axes with less than half of the least sum of squares, None without. Corners with information
     matrices (M, 2, 2) in px^-2 are compared at offsets within ``limits`` in s.
 
-    The focal length is that of the camera, or is fitted if there is none. Mirrored axes are compared if there is more
-    than one of the ``orientations``.
+    The focal length is that of the camera, or is fitted if there is none.
     """
     step = max(0.5 / rates.sample_rate, 4 * row_time, (limits[1] - limits[0]) / _MOST_OFFSETS)
     grid = limits[0] + step * torch.arange(max(2, math.ceil((limits[1] - limits[0]) / step) + 1), dtype=torch.float64)
@@ -113,16 +110,15 @@ def search_orientations(
         f = f if camera is None else torch.full_like(f, camera.focal_length)
         return energy - 2 * f * linear + f.square() * size - 2 * p[:, 2] + q[:, 2, 2], f
 
-    names = _ALL if len(orientations) > 1 else orientations
-    costs = {name: cost_of(name) for name in names}
+    costs = {name: cost_of(name) for name in _ALL}
 
     def start_at(name: str, index: int) -> Start:
         cost, f = costs[name]
         return Start(name, float(grid[index]), float(f[index]), float(cost[index]))
 
     best = {name: start_at(name, int(cost.argmin())) for name, (cost, _) in costs.items()}
-    starts = sorted((best[name] for name in orientations), key=lambda start: start.cost)
-    mirrored = [name for name in names if name not in orientations and best[name].cost < 0.5 * starts[0].cost]
+    starts = sorted((best[name] for name in ORIENTATIONS), key=lambda start: start.cost)
+    mirrored = [name for name in _ALL if name not in ORIENTATIONS and best[name].cost < 0.5 * starts[0].cost]
 
     # 4. Other offsets of the best orientation.
     cost = torch.nn.functional.pad(costs[starts[0].orientation][0], (1, 1), value=math.inf)

@@ -566,7 +566,6 @@ FIGURES.update(
         (DetectionResult, 1): _batch_figure,
         (detection.DisplacementSpectrum, 0): _spectrum_figure,
         (detection.MotionDetection, 0): _detected_motion_figure,
-        (gyroscope.ClockAlignment, 0): lambda result: motion_figure(result.motion),
         (gyroscope.RotationAlignment, 0): _rotation_figure,
         (Vibration, 0): motion_figure,
         (FreeMotion, 0): motion_figure,

@@ -1,4 +1,4 @@
-"""Alignment of a recording with a stack of any length: some of its frames are read and compared."""
+"""Alignment of a gyroscope with a stack of any length: some of its frames are read and compared."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -9,16 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.gyroscope.alignment import ClockAlignment, align_tracks
 from rsvib_torch.gyroscope.corner_tracks import corner_tracks
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
-from rsvib_torch.gyroscope.rotation_alignment import AlignOptions, RotationAlignment
+from rsvib_torch.gyroscope.rotation_alignment import AlignOptions, RotationAlignment, align_rates
 from rsvib_torch.io.frame_times import timing_from_first_frame
 from rsvib_torch.io.full_scale import counts_to_frames
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.io.stack_reading import open_stack
 from rsvib_torch.motion.camera import Camera
-from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.job import stored_frame
 
@@ -48,11 +46,11 @@ def align_stack(
     source: Path,
     info: StackInfo,
     timing: SensorTiming,
-    recorded: FreeMotion | AngularRates,
+    recorded: AngularRates,
     *,
     camera: Camera | None = None,
     ignore: Tensor | None = None,
-) -> ClockAlignment | RotationAlignment:
+) -> RotationAlignment:
     """``align_motion`` for a stack of any length, in bounded time and memory.
 
     The recording is compared with 48 pairs of neighbouring frames over the whole stack. ``info`` describes the stack,
@@ -61,7 +59,7 @@ def align_stack(
     timing = timing_from_first_frame(timing, info)
     pairs, starts = compared_pairs(info.shape[0]), timing.frame_starts(info.shape[0]).tolist()
     tracks = corner_tracks(_grey_frames(source, info, pairs, ignore), starts, timing)
-    return align_tracks(tracks, timing, recorded, AlignOptions(camera=camera, ignore=ignore))
+    return align_rates(tracks, timing, recorded, AlignOptions(camera=camera, ignore=ignore))
 
 
 def _grey_frames(

@@ -217,9 +217,7 @@ def test_one_axis_alone_leaves_the_others_open(tracks):
 def test_arguments(frames):
     rates = recorded()
     motion = rsv.FreeMotion.from_samples(torch.linspace(0, 1, 20), torch.zeros(20, 2))
-    with pytest.raises(ValueError, match="camera and fit_row_time are for angular rates"):
-        rsv.align_motion(frames, TIMING, motion, fit_row_time=True)
-    refuses(lambda: rsv.align_motion(frames, TIMING, rates.rates), "recorded must be", TypeError)
+    refuses(lambda: rsv.align_motion(frames, TIMING, motion), "recorded must be AngularRates", TypeError)
     with pytest.raises(ValueError, match=r"the recording of 0\.01 s is shorter than the frames"):
         rsv.align_motion(frames, TIMING, rsv.AngularRates(rates.times[:11], rates.rates[:11]))
     ramp = torch.linspace(0, 1, frames.shape[-1]).expand_as(frames) + 0.01 * torch.arange(COUNT)[:, None, None]
