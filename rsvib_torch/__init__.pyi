@@ -25,7 +25,6 @@ from .evaluation import psnr as psnr
 from .evaluation import slanted_edge_mtf as slanted_edge_mtf
 from .evaluation import ssim as ssim
 from .gyroscope import AngularRates as AngularRates
-from .gyroscope import ClockAlignment as ClockAlignment
 from .gyroscope import RotationAlignment as RotationAlignment
 from .gyroscope import align_motion as align_motion
 from .gyroscope import read_gyroscope as read_gyroscope

@@ -154,11 +154,6 @@ class FreeMotionOptions(ProjectionOptions, RegistrationOptions, MaskedInputOptio
 
 
 @options
-class OffsetOptions(RegistrationOptions, MaskedInputOptions):
-    """Options of functions that measure the offsets of row bands."""
-
-
-@options
 class BandRegistrationOptions(BandOptions, InputOptions):
     """Options of ``register_bands``."""
 

@@ -16,13 +16,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from benchmarks.resolution_chart import resolution_chart
 from rich.console import Console
 from torch import Tensor
 
 import rsvib_torch as rsv
 from rsvib_torch.commands.answers import write_detection
 from rsvib_torch.commands.terminal import warnings_in_one_line, working
-from rsvib_torch.datasets import city_and_fields, resolution_chart
+from rsvib_torch.datasets import city_and_fields
 from rsvib_torch.files.atomic import whole_folder
 from rsvib_torch.report import Report, write_report_page
 from rsvib_torch.text import text_table

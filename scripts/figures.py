@@ -15,13 +15,14 @@ from benchmarks.finer import EXPOSURE_ROWS, ROW_TIME, decibel
 from benchmarks.finer import MARGIN as FINER_MARGIN
 from benchmarks.independent_camera import POINTS_PER_PX, Array, still_image
 from benchmarks.pipeline import camera
+from benchmarks.resolution_chart import resolution_chart
 from kornia.augmentation import AugmentationSequential
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from torch import Tensor
 
 import rsvib_torch as rsv
-from rsvib_torch.datasets import city_and_fields, resolution_chart
+from rsvib_torch.datasets import city_and_fields
 from rsvib_torch.report.plots import offset_figure, psf_figure, save_figure
 
 SEED = 3

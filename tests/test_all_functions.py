@@ -28,6 +28,7 @@ PSF = rsv.row_psf(STILL, TIMES[:8], TIMING)
 NOISE = rsv.SensorNoise(full_well=5000.0, read_noise=0.01, bits=12)
 REFUSED = rsv.detect_vibration(FRAMES[:1].repeat(2, 1, 1), TIMING)  # a camera at rest: no axis is restored
 MOTION = rsv.FreeMotion.through(TIMES, VIBRATION.displacement(TIMES))
+RATES = rsv.AngularRates(MOTION.knots[1:-1], MOTION.velocity(MOTION.knots[1:-1])[:, [1, 0, 0]] / 1e4)
 
 
 def memory_of(value, seen=None, within_tracker=False):
@@ -125,7 +126,7 @@ CASES = (
             FRAMES,
         ),
         "detect_vibration, bands": (partial(detect, method="bands", tones=2), FRAMES),
-        "align_motion": (lambda frames: rsv.align_motion(frames, TIMING, MOTION, offsets=(-0.002, 0.002)), FRAMES),
+        "align_motion": (lambda frames: rsv.align_motion(frames, TIMING, RATES, camera=rsv.Camera(1e4)), FRAMES),
         "restore, holes": (lambda frames, ignore: restore(frames, ignore=ignore, **HARD), FRAMES, FRAMES > 0.8),
         "RowVaryingBlur.A_adjoint": (rsv.RowVaryingBlur(PSF).A_adjoint, FRAMES[0, :8]),
         "restore, no axis": (partial(restore, vibration=REFUSED), FRAMES),

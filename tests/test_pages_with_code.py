@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from benchmarks.resolution_chart import resolution_chart
 
 import rsvib_torch as rsv
-from rsvib_torch.datasets import resolution_chart
 from rsvib_torch.registration.methods import BAND_METHODS
 from rsvib_torch.restoration.priors import PRIORS
 from rsvib_torch.results.reason import REASONS

@@ -48,13 +48,6 @@ def augmented(frames, timing, motion):
     return {"image": rsv.RollingShutterVibration(timing, **ranges)(frames[:, None])}
 
 
-def aligned(frames, timing, motion):
-    times = torch.linspace(-0.01, 0.1, 1100, dtype=torch.float64)
-    recording = rsv.FreeMotion.from_samples(times, motion.displacement(times))
-    found = rsv.align_motion(frames, timing, recording, offsets=(-0.002, 0.002))
-    return {"vector": moved(found.motion)}
-
-
 def restored(frames, timing, motion, **options):
     return {"image": rsv.restore(frames, timing, motion, check=False, **options)}
 
@@ -66,7 +59,6 @@ FUNCTIONS = {
     "detect_motion": (free, 1e-3, True),
     "tracker": (tracked, 1e-4, False),
     "judge_restoration": (judged, 1e-3, False),
-    "align_motion": (aligned, 1e-3, False),
     "RollingShutterVibration": (augmented, 1e-4, False),
     "restore, exact": (restored, 1e-4, True),
     "restore, banded": (partial(restored, method="banded"), 1e-4, True),

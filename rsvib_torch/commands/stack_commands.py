@@ -121,8 +121,8 @@ class RestoreOptions(shared.RestorationCommand):
     """Focal length in px; required for angles and angular rates."""
     lens_profile: Path | None = option(None, show_default="a lens without distortion")
     """With a gyroscope: lens profile of Gyroflow (JSON)."""
-    offset: float | None = option(None, show_default="estimated from the frames")
-    """With --unit: time of the recording, in s, at the exposure start of the first row of frame 0."""
+    offset: float | None = option(None, show_default="for a gyroscope, estimated from the frames")
+    """Required with --unit: time of the recording, in s, at the exposure start of the first row of frame 0."""
     ignore: list[str] | None = option(None, metavar="ROWS[,COLUMNS]", show_default="all rows count")
     """Rows of the frames, or a part of them, that do not count in the comparison with the recording, for example 400:
     for a dashboard below row 400, or :60,500: for a sign in a corner; may be given several times."""
@@ -149,8 +149,8 @@ class RestoreOptions(shared.RestorationCommand):
 def restore(given: RestoreOptions) -> Answer:
     """Restore a stack of frames with a detected vibration or a recorded motion.
 
-    The offset of a recorded motion, of a gyroscope or an attitude sensor, is stated (--offset), or found by the offsets
-    of rows between the frames: a motion that does not explain them is refused. If the restored frames are judged no
+    The offset of a recorded motion is stated (--offset); that of a gyroscope is found by the frames: rates that do not
+    explain them are refused. If the restored frames are judged no
     better than the input, the input is written unchanged. --force restores in both cases.
     """
     settings, frames, vibration = given.settings, given.frames, given.vibration
@@ -190,12 +190,14 @@ def _motion_of_frames(given: RestoreOptions, path: Path, info: StackInfo, answer
     recorded, timing = _recorded(given, path), given.settings.timing
     ignore = stacks.mask_of_regions(given.ignore or (), (info.shape[-2], info.shape[-1]))
     print_notes(info, given.settings)
-    if isinstance(recorded, rsvib_torch.FreeMotion) and given.offset is not None:
+    if isinstance(recorded, rsvib_torch.FreeMotion):
+        if given.offset is None:
+            raise ValueError(f"--unit {given.unit} needs --offset: the time of the recording when frame 0 begins, in s")
         return recorded.retimed(given.offset)
     camera = None
     if given.lens_profile is not None:
         camera = rsvib_torch.Camera.from_gyroflow(given.lens_profile, info.shape[-1], info.shape[-2])
-    elif given.unit is None and given.focal_length is not None:
+    elif given.focal_length is not None:
         camera = rsvib_torch.Camera(given.focal_length)
     with working("aligning the recording"):
         found = stacks.align_stack(given.frames, info, timing, recorded, camera=camera, ignore=ignore)

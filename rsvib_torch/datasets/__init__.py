@@ -1,4 +1,4 @@
-"""Drawn still scenes, and example frames made from them: a resolution chart, and a landscape from above."""
+"""A drawn landscape from above, and example frames made from it."""
 
 import lazy_loader
 

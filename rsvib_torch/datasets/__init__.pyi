@@ -1,3 +1,2 @@
-from .chart import resolution_chart as resolution_chart
 from .landscape import city_and_fields as city_and_fields
 from .landscape import example_frames as example_frames

@@ -1,4 +1,4 @@
-from .alignment import ClockAlignment, align_motion
+from .alignment import align_motion
 from .gpmf_track import CameraTrack, read_camera_track
 from .gyroscope_rates import AngularRates
 from .read_gyroscope import read_gyroscope
@@ -8,7 +8,6 @@ __all__ = [
     "AlignOptions",
     "AngularRates",
     "CameraTrack",
-    "ClockAlignment",
     "RotationAlignment",
     "align_motion",
     "read_camera_track",

@@ -17,7 +17,7 @@ from rsvib_torch.gyroscope.rotation_search import Start, search_orientations
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.options import OffsetOptions
+from rsvib_torch.options import MaskedInputOptions
 from rsvib_torch.results.presentation import JudgedResult
 from rsvib_torch.results.reason import Reason
 from rsvib_torch.text import measured_text, text_table, wrapped
@@ -164,8 +164,8 @@ def outside(offset: float, std: float, limits: tuple[float, float] | None) -> li
 
 
 @option_group
-class AlignOptions(OffsetOptions):
-    """Options of ``align_motion``; bands are those of the start, and not used for angular rates."""
+class AlignOptions(MaskedInputOptions):
+    """Options of ``align_motion``."""
 
     camera: Camera | None = Field(
         default=None, description="Focal length and lens, for angular rates; by default the focal length is fitted."
@@ -186,7 +186,7 @@ class AlignOptions(OffsetOptions):
 def align_rates(
     tracks: CornerTracks, timing: SensorTiming, rates: AngularRates, options: AlignOptions
 ) -> RotationAlignment:
-    """``align_motion`` for angular rates, from the corners of pairs of frames."""
+    """``align_motion`` from the corners of pairs of frames."""
     camera, offsets = options.camera, options.offsets
     if camera is not None:
         camera.check_size(tracks.size[1], tracks.size[0])
@@ -202,17 +202,16 @@ def align_rates(
         return torch.tensor(values, dtype=torch.float64)
 
     # 1. Axes and offsets that explain the displacements best, and the fit from there with the smallest residuals.
-    search = search_orientations(tracks, tracks.roughly(), rates, timing.row_time, limits, camera)
-    lens = camera or Camera(search.starts[0].focal_length)
-    first = search.starts[0]
+    (first, *_), _, _ = search_orientations(tracks, tracks.roughly(), rates, timing.row_time, limits, camera)
+    lens = camera or Camera(first.focal_length)
     model = RotationModel(tracks, rates, first.orientation, lens, middle, free)
     fit = fit_robustly(model, parameters(first, timing.row_time))
 
     # 2. What does not follow the gyroscope has no weight in a second search, and parallax little.
     row_time = float(fit.parameters[6])
     lens = replace(lens, focal_length=float(fit.parameters[5]))
-    again = search_orientations(tracks, fit.information(), rates, row_time, limits, lens)
-    best = again.starts[0]
+    starts, other_offsets, mirrored = search_orientations(tracks, fit.information(), rates, row_time, limits, lens)
+    best = starts[0]
     if best.orientation != first.orientation or abs(best.offset - first.offset) > 5 / rates.sample_rate:
         model = replace(model, orientation=best.orientation)
         fit = fit_robustly(model, parameters(best, timing.row_time))
@@ -222,12 +221,12 @@ def align_rates(
         near = start.cost < _MAX_COST * best.cost
         return near and fit.significance(start.orientation, parameters(start, row_time)) < _CERTAIN
 
-    others = [start for start in again.starts if start.orientation != fit.model.orientation][:_MOST_OTHERS]
+    others = [start for start in starts if start.orientation != fit.model.orientation][:_MOST_OTHERS]
     axes = [start.orientation for start in others if explains(start)]
-    other = next((start.offset for start in again.other_offsets[:_MOST_OTHERS] if explains(start)), None)
+    other = next((start.offset for start in other_offsets[:_MOST_OTHERS] if explains(start)), None)
     ambiguous: list[Reason] = []
-    if again.mirrored is not None:
-        ambiguous.append(Reason("axes_mirrored", details={"axes": again.mirrored}))
+    if mirrored is not None:
+        ambiguous.append(Reason("axes_mirrored", details={"axes": mirrored}))
     if axes:
         ambiguous.append(Reason("axes_ambiguous", details={"axes": ", ".join(axes)}))
     return _result(fit, ambiguous, other, rows, offsets)
@@ -250,7 +249,8 @@ def _result(
     first, last = float(middles[0, 0]) - 0.5 * rows * row_time, float(middles[-1, 1]) + 0.5 * rows * row_time
     clock = scale * (torch.tensor([first, last], dtype=torch.float64) - model.middle) + at
 
-    moved = (predicted - predicted.mean(0)).square().mean(0).sqrt()
+    moved = model.components(fit.parameters, model.tracks.times(row_time))  # of the rows of the corners
+    moved = (moved - moved.mean(0)).square().mean(0).sqrt()
     reasons = recording_reasons(moved[:2].tolist(), unexplained[:2].tolist(), other)
     reasons += ambiguous + _uncertain(fit, std) + outside(offset, offset_std, offsets)
     steps = model.rates.times.diff()

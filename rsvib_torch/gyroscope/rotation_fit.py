@@ -156,7 +156,7 @@ class RotationFit:
         """(M, 2, 2) px^-2, inverse covariances of the displacements of the corners."""
         line, errors = self.parallax(), self.errors
         spread = errors.depth**2 * line[..., None] * line[:, None]
-        inverse = torch.linalg.inv(errors.sigma**2 * torch.eye(2) + spread)
+        inverse = torch.linalg.inv(errors.sigma**2 * torch.eye(2).to(spread) + spread)
         return errors.weight[:, None, None] * inverse
 
     def parallax(self) -> Tensor:
@@ -189,7 +189,7 @@ class _Residuals:
     def at(cls, fit: RotationFit) -> "_Residuals":
         tracks = fit.model.tracks
         slopes, factors = fit.model.slopes(fit.parameters)
-        turned = factors * torch.tensor([1.0, 1.0, 1 / tracks.radius])
+        turned = factors * factors.new_tensor([1.0, 1.0, 1 / tracks.radius])
         return cls(tracks.offsets - fit.model.predicted(fit.parameters), slopes, turned)
 
 
@@ -365,7 +365,7 @@ def _with_correlated_errors(fit: RotationFit) -> RotationFit:
     pairs = len(tracks.starts)
     first, later = fit.effects[:-1], fit.effects[1:]
     rho = (first * later).sum(0) / (0.5 * (first.square() + later.square()).sum(0)).clamp(min=1e-300)
-    rho = rho.clamp(0.0, 0.9) if pairs > 8 else torch.zeros(6)  # fewer pairs have no known correlation
+    rho = rho.clamp(0.0, 0.9) if pairs > 8 else torch.zeros(6).to(rho)  # fewer pairs have no known correlation
     wide = errors.effects * ((1 + rho) / (1 - rho) * pairs / max(pairs - int(free.sum()) / 3, 1.0)).sqrt()
     rest = _Residuals.at(fit)
     linear, wider = _linear(fit, rest), replace(fit, errors=replace(errors, effects=wide))

@@ -40,15 +40,6 @@ class Start:
     cost: float  # weighted sum of squares
 
 
-@dataclass(frozen=True)
-class OrientationSearch:
-    """Start values with the least sums of squares."""
-
-    starts: tuple[Start, ...]  # one for each rotation of the axes, best first
-    other_offsets: tuple[Start, ...]  # other local minima of the best orientation, best first
-    mirrored: str | None  # a mirrored orientation with less than half of the least sum of squares
-
-
 def search_orientations(
     tracks: CornerTracks,
     information: Tensor,
@@ -56,8 +47,11 @@ def search_orientations(
     row_time: float,
     limits: tuple[float, float],
     camera: Camera | None,
-) -> OrientationSearch:
-    """Compare corners, with information matrices (M, 2, 2) in px^-2, at offsets within ``limits`` in s.
+) -> tuple[list[Start], list[Start], str | None]:
+    """Start values of every rotation of the axes, and at other offsets (local minima) of the best one; the best first.
+
+    Also returns mirrored axes with less than half of the least sum of squares, None without. Corners with information
+    matrices (M, 2, 2) in px^-2 are compared at offsets within ``limits`` in s.
 
     The focal length is that of the camera, or is fitted if there is none.
     """
@@ -124,12 +118,10 @@ def search_orientations(
 
     best = {name: start_at(name, int(cost.argmin())) for name, (cost, _) in costs.items()}
     starts = sorted((best[name] for name in ORIENTATIONS), key=lambda start: start.cost)
-    mirrored = min((best[name] for name in _ALL if name not in ORIENTATIONS), key=lambda start: start.cost)
+    mirrored = [name for name in _ALL if name not in ORIENTATIONS and best[name].cost < 0.5 * starts[0].cost]
 
     # 4. Other offsets of the best orientation.
     cost = torch.nn.functional.pad(costs[starts[0].orientation][0], (1, 1), value=math.inf)
     valleys = ((cost[1:-1] <= cost[:-2]) & (cost[1:-1] <= cost[2:])).nonzero()[:, 0].tolist()
     others = sorted((start_at(starts[0].orientation, index) for index in valleys), key=lambda start: start.cost)[1:]
-    return OrientationSearch(
-        tuple(starts), tuple(others), mirrored.orientation if mirrored.cost < 0.5 * starts[0].cost else None
-    )
+    return starts, others, min(mirrored, key=lambda name: best[name].cost, default=None)

@@ -9,7 +9,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Self
 
 import torch
@@ -23,7 +22,6 @@ from rsvib_torch.results.presentation import Result
 
 _FIXED_POINT_STEPS = 2  # the displacement of 10 px changes by 1 % along y: two steps leave 1e-5 px
 _STEP = 1e-6  # s, of the derivative with respect to time; float64 leaves 1e-8 of the velocity
-_RAY_DEGREE = 9  # of a polynomial along a column; rays are then within 1e-6 rad for a field of 80 degrees
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -241,36 +239,17 @@ class ColumnMotion(Motion):
         heights, _ = torch.broadcast_tensors(row - 0.5 * (self.num_rows - 1), components[..., 0])
         return torch.as_tensor(heights)
 
-    @cached_property
-    def _ray_coefficients(self) -> Tensor:
-        """(..., 2, K): polynomials of ``y / (0.55 num_rows)`` for the rays u and v of the content of the columns."""
-        camera = self.components.camera or Camera(1.0)
-        degree = _RAY_DEGREE if camera.distorts else 1
-        nodes = torch.cos(math.pi * torch.linspace(0, 1, 4 * degree + 1, dtype=torch.float64, device=self.device))
-        x, y = torch.broadcast_tensors(self.column[..., None], 0.55 * self.num_rows * nodes)
-        values = torch.stack(camera.rays(x, y), -2)
-        powers = nodes[:, None] ** torch.arange(degree + 1, device=self.device)
-        return values @ torch.linalg.pinv(powers).mT
-
     def _content(self, starts: Tensor, components: Tensor) -> tuple[Tensor, Tensor]:
         """Content of rows exposed from ``starts`` (S) on, at components (S, A): x and y, or rays u and v, (S)."""
         height, camera = self._heights(starts, components), self.components.camera
-        trailing = (1,) * (height.ndim - self.column.ndim)
+        x = self.column[(..., *(None,) * (height.ndim - self.column.ndim))].expand_as(height)
         if camera is None:
-            x = self.column.reshape(*self.column.shape, *trailing).expand_as(height)
             scale = 1.0 + components[..., 3] if components.shape[-1] > 3 else 1.0
             return x, (height - components[..., 1] - components[..., 2] * x) / scale
-        coefficients = self._ray_coefficients.reshape(*self.column.shape, *trailing, 2, -1)
         y = height - components[..., 1]
-        for step in range(_FIXED_POINT_STEPS + 1):
-            place = (y / (0.55 * self.num_rows)).clamp(-1.0, 1.0)[..., None]
-            rays = coefficients[..., -1].expand(*height.shape, 2)
-            for power in reversed(range(coefficients.shape[-1] - 1)):
-                rays = torch.addcmul(coefficients[..., power], rays, place)
-            u, v = rays.unbind(-1)
-            if step < _FIXED_POINT_STEPS:
-                y = height - camera.displacement_of_rays(components, u, v)[..., 1]
-        return u, v
+        for _ in range(_FIXED_POINT_STEPS):
+            y = height - camera.displacement_of_rays(components, *camera.rays(x, y))[..., 1]
+        return camera.rays(x, y)
 
     def _displaced(self, components: Tensor, content: tuple[Tensor, Tensor]) -> Tensor:
         """Displacement (S, 2) of ``_content`` by components (S, A)."""

@@ -556,7 +556,6 @@ FIGURES.update(
         DetectionResult: offset_figure,
         detection.DisplacementSpectrum: _spectrum_figure,
         detection.MotionDetection: _detected_motion_figure,
-        gyroscope.ClockAlignment: lambda result: motion_figure(result.motion),
         gyroscope.RotationAlignment: _rotation_figure,
         Vibration: motion_figure,
         FreeMotion: motion_figure,

@@ -108,7 +108,6 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     augmentation = rsv.RollingShutterVibration(timing, **random_tones)
     detector = rsv.VibrationDetector(timing, **DETECTION)
     restorer = rsv.VibrationRestorer(timing, method="dewarp", check=False)
-    alignment = rsv.align_motion(frames, timing, recorded, offsets=(-0.001, 0.001), **BANDS)
     verdict = rsv.judge_restoration(frames, restored, timing, vibration)
     optics, sensor_noise = rsv.Optics(0.5, 0.4, 1.0), rsv.SensorNoise(5000.0, 0.01, 12, 0.01, 0.01, 0.01, 3)
     calibration = rsv.RowTimeCalibration(1e-4, 1e-6, 12.0, 0.3, 1000.0, 104.0, "forward", ())
@@ -152,7 +151,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     fast = {"method": "bands", "tones": 1}
     new = {name: folder / name for name in ("new.npy", "new.mkv", "figure.png", "maps")}
     different: dict[str, dict[str, Any]] = {  # values that differ from the pool, by function
-        "align_motion": {"camera": None},
+        "align_motion": {"camera": None, "recorded": rates},
         "calibrate_row_time": {"frames": stripes},
         "calibrate_row_time_by_motion": {"row_time": (5e-5, 2e-4)},
         "comparison_figure": {"size": 32, "restored": restored[0]},
@@ -213,7 +212,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     described = (detected.std, curve, optics, sensor_noise, info, report, verdict, calibration, camera)
     described += (tracked,)
     described += (detected.spectrum(), rsv.CameraMode("A", "B", "", 1920, 1080, 30.0, 0.01, 1e-4, 3, "forward", 1080))
-    described += (detected, detected.offsets, free, alignment, rates, rotation)
+    described += (detected, detected.offsets, free, rates, rotation)
     for value in described:
         result[type(value).__name__] = _with_fields(value)
     for value in (vibration, recorded, timing, *described):

@@ -18,12 +18,13 @@ import numpy as np
 import torch
 from benchmarks import library_chain as libraries
 from benchmarks.independent_camera import Shake, closed, take_frames
+from benchmarks.resolution_chart import resolution_chart
 from harness import Rows, in_turns, table, table_of
 from numpy.typing import NDArray
 from torch import Tensor
 
 import rsvib_torch as rsv
-from rsvib_torch.datasets import city_and_fields, resolution_chart
+from rsvib_torch.datasets import city_and_fields
 
 SCENES: dict[str, Callable[[int, int, int], Tensor]] = {
     "city": city_and_fields,

@@ -17,11 +17,12 @@ import torch
 from benchmarks import independent_camera
 from benchmarks.independent_camera import Array, Shake, closed
 from benchmarks.pipeline import camera
+from benchmarks.resolution_chart import resolution_chart
 from harness import Rows, one_thread, table
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import rsvib_torch as rsv
-from rsvib_torch.datasets import city_and_fields, resolution_chart
+from rsvib_torch.datasets import city_and_fields
 
 OPTIONS = {
     "trials": (10, "reproduction: trials"),

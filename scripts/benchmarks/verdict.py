@@ -15,10 +15,11 @@ import numpy as np
 import torch
 from benchmarks.finer import decibel
 from benchmarks.independent_camera import Array, Shake, closed, take_frames
+from benchmarks.resolution_chart import resolution_chart
 from harness import Rows, one_thread, table
 
 import rsvib_torch as rsv
-from rsvib_torch.datasets import city_and_fields, resolution_chart
+from rsvib_torch.datasets import city_and_fields
 from rsvib_torch.restoration import judge_restoration, restore
 
 OPTIONS = {

@@ -5,10 +5,11 @@ import math
 import numpy as np
 import pytest
 import torch
+from benchmarks.resolution_chart import bars, resolution_chart
 from scipy.ndimage import gaussian_filter
 
-from rsvib_torch.datasets import city_and_fields, resolution_chart
-from rsvib_torch.datasets.drawing import bars, rectangle, rotated
+from rsvib_torch.datasets import city_and_fields
+from rsvib_torch.datasets.drawing import rectangle, rotated
 
 SCENES = {"chart": resolution_chart, "city": lambda height, width: city_and_fields(height, width, seed=11)}
 

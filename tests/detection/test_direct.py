@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 import torch
 from benchmarks.honesty_cases import recording
+from benchmarks.resolution_chart import resolution_chart
 from scipy import ndimage
 from small_video import write_video
 from truth import Curve, Motion, draw_scene, recorded, take_frames, tone_errors
 
 from rsvib_torch import SensorNoise, SensorTiming, Vibration, detect_vibration, read_stack, simulate_frames
-from rsvib_torch.datasets import city_and_fields, resolution_chart
+from rsvib_torch.datasets import city_and_fields
 
 
 def check(result, motion, period, amplitude, phase):

@@ -11,9 +11,9 @@ import detections
 import numpy as np
 import pytest
 import torch
+from benchmarks.resolution_chart import resolution_chart
 from program import rsvib
 
-from rsvib_torch.datasets import resolution_chart
 from rsvib_torch.imaging import SensorNoise, simulate_frames
 from rsvib_torch.io import write_stack
 from rsvib_torch.motion.timing import SensorTiming

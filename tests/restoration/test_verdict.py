@@ -6,13 +6,14 @@ import warnings
 
 import pytest
 import torch
+from benchmarks.resolution_chart import resolution_chart
 from detections import detection_of
 from field_truth import FieldMotion, take_field_frames
 from refusals import without_warning
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration
-from rsvib_torch.datasets import city_and_fields, resolution_chart
+from rsvib_torch.datasets import city_and_fields
 from rsvib_torch.restoration import RestorationWarning, judge_restoration, restore
 from rsvib_torch.restoration.judge import pairs_to_judge
 from rsvib_torch.restoration.restoration_verdict import outcome_of_pair

@@ -283,13 +283,6 @@ def residual_of_motion(measured: Measurements, motion: Motion) -> Array:
     return measured.relative(measured.displacements - _moved(measured, motion))
 
 
-def rms_motion(measured: Measurements, motion: Motion) -> Array:
-    """(2,) px, rms displacement of scene rows about their mean over the frames, by a motion as above."""
-    moved = measured.relative(_moved(measured, motion))[0]
-    square = np.square(moved).sum(1) / np.maximum(measured.num_differences[0], 1.0)[:, None]
-    return np.sqrt(square.mean(0))
-
-
 def _moved(measured: Measurements, motion: Motion) -> Array:
     """Displacements (1, N, G, A) in px of the rows by a motion, means over the exposure and the rows of a band."""
     starts, duration = tensor(measured.exposure_starts), measured.average_times[1]

@@ -1,4 +1,4 @@
-"""A resolution chart similar to that of ISO 12233."""
+"""A resolution chart similar to that of ISO 12233: a scene of tests and benchmarks."""
 
 import math
 from collections.abc import Callable
@@ -10,10 +10,67 @@ from torch import Tensor
 
 from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.datasets import drawing
-from rsvib_torch.datasets.drawing import FLOAT, Blur, Canvas, Size, bars, disc, edge, rectangle, rotated, sectors
+from rsvib_torch.datasets.drawing import FLOAT, Blur, Size, edge, rectangle, rotated
 
 _INK, _PAPER = 0.07, 0.86  # of full scale; a printed chart: grain and texture of either stay within 0 ... 1
 _Centre = tuple[float, float]
+
+
+def disc(x: Tensor, y: Tensor, radius: float, sigma: float) -> Tensor:
+    """Coverage of a disc; its curvature over the width of the blur is neglected."""
+    return edge(radius - torch.hypot(x, y), sigma)
+
+
+def bars(cycles: Tensor, frequency: Tensor | float, count: int, sigma: float) -> Tensor:
+    """Coverage of ``count`` bars, half a cycle wide each, from 0 to ``count - 1/2`` cycles, with a blur in px.
+
+    The frequency in cycles/px is constant for a bar group and varies along the bars for a wedge.
+    """
+    coverage = torch.zeros_like(cycles)
+    for index in range(2 * count):
+        step = edge((cycles - 0.5 * index) / frequency, sigma)
+        coverage = coverage - step if index % 2 else coverage + step
+    return coverage
+
+
+def sectors(x: Tensor, y: Tensor, count: int, sigma: float) -> Tensor:
+    """Coverage of a star of ``count`` sectors; valid where the radius exceeds ``count / pi`` px (Nyquist)."""
+    frequency = count / (2 * math.pi * torch.hypot(x, y).clamp(min=1e-3))
+    cycles = torch.remainder(torch.atan2(y, x) * (count / (2 * math.pi)), 1.0) + 2.0
+    return bars(cycles, frequency, 6, sigma).clamp(0.0, 1.0)
+
+
+class Canvas:
+    """An image to paint on, one shape after another, each within its own window."""
+
+    def __init__(self, image: Tensor, sigma: float) -> None:
+        self.image = image
+        self.sigma = sigma
+
+    def transposed(self) -> "Canvas":
+        """The same image with x and y exchanged."""
+        return Canvas(self.image.T, self.sigma)
+
+    def paint(
+        self,
+        centre: tuple[float, float],
+        reach: float | tuple[float, float],
+        tone: float,
+        coverage: Callable[[Tensor, Tensor], Tensor],
+    ) -> None:
+        """Paint a tone over the image.
+
+        The window has the half size ``reach`` (x, y) in px around the centre (column, row). ``coverage`` is a function
+        of the coordinates x (1, w) and y (h, 1) in px from the centre.
+        """
+        halves = reach if isinstance(reach, tuple) else (reach, reach)
+        places = []
+        for middle, half, size in zip(centre, halves, reversed(self.image.shape), strict=True):
+            pad = half + 5 * self.sigma
+            places.append(slice(max(math.floor(middle - pad), 0), min(math.ceil(middle + pad) + 1, size)))
+        window = self.image[places[1], places[0]]
+        columns, rows = (torch.arange(place.start, place.stop, device="cpu") for place in places)
+        window += coverage(columns[None] - centre[0], rows[:, None] - centre[1]) * (tone - window)
 
 
 @checks_arguments
