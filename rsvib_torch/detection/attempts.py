@@ -69,7 +69,6 @@ def detect_tones(
         hypothesis = Hypothesis(
             FieldScale(most_axes, width, height, field.camera),
             is_doubtful=not requested,
-            has_pattern=refined is not None and refined.has_pattern,
             translation=translation.fit,
         )
         rotation = attempt(stacks, row_timing, options, hypothesis)
@@ -177,7 +176,6 @@ def _diagnosis(
     ``axes`` (x, y) in row order contradict the stated one; ``rotates``: whether the halves of the rows move apart.
     """
     num_frames, height, width = stack.images.shape[1:]
-    only = slice(index, index + 1)
 
     # 1. The candidates, each with the frequencies of one tone of each axis if they are known. The rows of a frame and
     # the phase from frame to frame agree with one period of the frames.
@@ -200,13 +198,9 @@ def _diagnosis(
 
     # 2. The first one with which detection is reliable along the axes that contradict the stated timing.
     for candidate, known in candidates:
-        turned, curve, bands = stack, found.start.curve, None
-        if (candidate.scan_axis, candidate.readout_direction) == (timing.scan_axis, timing.readout_direction):
-            bands = replace(curve, offsets=curve.offsets[only], quality=curve.quality[only])
-        else:
-            turned = stack.with_timing(candidate)
+        turned = stack.with_timing(candidate)
         scale = FieldScale(2, turned.images.shape[-1], turned.images.shape[-2])
-        hypothesis = Hypothesis(scale, is_doubtful=True, known_offsets=bands, frequencies=known)
+        hypothesis = Hypothesis(scale, is_doubtful=True, frequencies=known)
         other = attempt(turned, candidate.in_row_order(), found.options, hypothesis)
         concerned = axes if candidate.scan_axis == timing.scan_axis else axes[::-1]
         refused = any(against and axis for against, axis in zip(other.findings[0], concerned, strict=True))

@@ -28,7 +28,6 @@ from rsvib_torch.detection.tones.fit import (
     shrunk,
     tone_displacements,
     with_errors_of_blocks,
-    with_unknown_errors,
 )
 from rsvib_torch.detection.tones.selection import find_tones, robust_fit, too_small
 from rsvib_torch.detection.tones.uncertainty import (
@@ -71,9 +70,7 @@ class Hypothesis:
     # of the rows move apart, another timing because tones do not explain the rows. The attempt is then abandoned early
     # if a large residual remains.
     is_doubtful: bool = False
-    has_pattern: bool | None = None  # whether the frames have a pattern of columns; None if it is not known
     translation: ToneFit | None = None  # fit without roll and zoom, from which a fit with roll or zoom starts
-    known_offsets: OffsetCurve | None = None  # offsets of the row bands of these frames, measured with another timing
     frequencies: Array | None = None  # (B, A, 1) Hz of one tone of each axis
 
 
@@ -109,12 +106,6 @@ class Attempt:
         refined = self.fitted.refined
         return np.zeros_like(self.fit.centre, dtype=bool) if refined is None else refined.abandoned
 
-    @property
-    def visible(self) -> Array:
-        """(B,) bool, stacks of which rows or bands were measured."""
-        refined = self.fitted.refined
-        return np.ones_like(self.fit.centre, dtype=bool) if refined is None else refined.other_motion.measured > 0
-
 
 def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hypothesis: Hypothesis) -> Attempt:
     """Detect the vibration of B stacks under a hypothesis; the sensor is in row order."""
@@ -124,8 +115,7 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
 
     # 1. Start: the offsets of row bands between consecutive frames, and the tones that are known.
     if scale.same_for_all_columns:
-        known = hypothesis.known_offsets
-        start = band_start(stacks, timing, options.bands, known, mere_start=not method.needs_whole_curve)
+        start = band_start(stacks, timing, options.bands, mere_start=not method.needs_whole_curve)
     else:
         start = field_start(stacks, timing, options.bands, scale, hypothesis.translation)
     if hypothesis.frequencies is not None:
@@ -136,16 +126,13 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
     # 2. Fit: tones and image motion, to the bands or to the rows.
     fitted = method.fit(start, stacks, timing, options, hypothesis)
 
-    # 3. Uncertainty: what the residual does not contain. Fits with hardly more measurements than parameters are exact
-    # for any errors; a part of the scene has the same errors in all frames; aliasing biases the displacements; the
-    # record may contain a further tone. The displacement is that of every eighth row of all frames.
+    # 3. Uncertainty: what the residual does not contain. A part of the scene has the same errors in all frames,
+    # aliasing biases the displacements, and the record may contain a further tone. The displacement is that of every
+    # eighth row of all frames.
     intervals = compared_intervals(timing, num_frames, method.max_group_frames)
     row_starts = table(timing.row_starts(num_frames, height)[:, ::8].flatten())
-    measurements = fitted.measurements
-    refined = fitted.refined
-    if refined is None:
-        fit = with_unknown_errors(measurements, fitted.fit)
-    else:
+    measurements, fit, refined = fitted.measurements, fitted.fit, fitted.refined
+    if refined is not None:
         measurements, fit = _with_errors_of_scene(refined, fitted.fit, intervals, timing)
         small = too_small(fit, intervals, timing.exposure_time) & (fit.amplitude < fit.amplitude.max(-1, keepdims=True))
         if options.max_tones < math.inf and small.any():  # aliasing was taken for further tones
@@ -242,7 +229,7 @@ def fit_directly(
         frames = grouped_frames(stacks.images, stacks.valid, timing, motion)
     else:  # pairs take several times as long, and are not needed to find that there is no roll
         frames = grouped_strips(stacks.images, stacks.valid, timing, motion, scale, pairs=not doubtful)
-    refined = refine(frames, intervals, fit, options.tones, may_abandon=doubtful, has_pattern=hypothesis.has_pattern)
+    refined = refine(frames, intervals, fit, options.tones, may_abandon=doubtful)
     # Bands that move within their height contain twice the frequency of a tone, as a tone that is larger than the frame
     # if it is nearly blind (3 of 200 recordings in four and eight frames), or none (1 of 60 in two frames, with another
     # axis that was wrong): where the rows contradict the fit, one tone of each axis is tried.
@@ -260,8 +247,7 @@ def fit_directly(
         motion = motion_of_fit(shrunk(refined.fit, intervals), stacks.images.device)
         if not frames.suits(motion) or (doubtful and frames.differently_blurred(motion).any()):
             frames = grouped_strips(stacks.images, stacks.valid, timing, motion, scale)
-            again = refine(frames, intervals, refined.fit, options.tones, has_pattern=hypothesis.has_pattern)
-            refined = replace(again, abandoned=refined.abandoned)
+            refined = replace(refine(frames, intervals, refined.fit, options.tones), abandoned=refined.abandoned)
     group_frames = [group.size for group in refined.frames.groups for _ in range(group.count)]
     curve = offset_curve(refined.measurements, refined.fit, refined.robust_weights, group_frames, stacks.images.device)
     return Fitted(refined.fit, refined.measurements, *curve, refined)

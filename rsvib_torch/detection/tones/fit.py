@@ -198,11 +198,16 @@ class _Problem:
         return self.measurements.num_measurements - split_axis(self.free, 1, self.axes, -1).sum(-1)
 
     def variances(self, state: _Estimate) -> Array:
-        """(B, 2) variance of the errors of each axis, in units of those of the measurements, from the residual."""
-        spare = np.maximum(self.num_spare, 1.0)
+        """(B, 2) variance of the errors of each axis, in units of those of the measurements, from the residual.
+
+        A fit with no more independent measurements than parameters is exact for any errors, which then count as large
+        as the displacements.
+        """
+        measurements, spare = self.measurements, np.maximum(self.num_spare, 1.0)
         if self.axes > 2:  # unequal variances would not keep the precise combinations of correlated components
             return np.broadcast_to((state.cost / spare.sum(-1))[:, None], spare.shape)
-        return self.measurements.square(state.residual) / spare
+        largest = measurements.square(measurements.displacements) / np.maximum(measurements.num_measurements, 1.0)
+        return np.where(self.num_spare > 0, measurements.square(state.residual) / spare, largest)
 
     def covariance(self, state: _Estimate, deviation: Array) -> Array:
         """Covariance (B, 2 P, 2 P) for errors of a row of the covariance ``S W^-1 S``, S the deviations (B, 2)."""
@@ -389,22 +394,6 @@ def with_errors_of_blocks(measurements: Measurements, fit: ToneFit) -> ToneFit:
     ratio = scatter.diagonal(axis1=-2, axis2=-1) / np.maximum(stated.diagonal(axis1=-2, axis2=-1), 1e-300)
     factor = np.sqrt(np.clip(without_nan(ratio, 1.0), 1.0, 1e4))
     return replace(fit, covariance=turn.mT @ (stated * factor[:, :, None] * factor[:, None]) @ turn)
-
-
-def with_unknown_errors(measurements: Measurements, fit: ToneFit) -> ToneFit:
-    """The fit with errors as large as the displacements on axes with no more independent measurements than parameters.
-
-    Such a fit is exact for any errors, and its residual contains nothing of them.
-    """
-    problem = _Problem(measurements, fit.active, fit.drift_order)
-    unknown = problem.num_spare <= 0.0
-    if not bool(unknown.any()):
-        return fit
-    fit = fit.about(measurements.centre)
-    state = problem.evaluate(fit.parameters)
-    largest = measurements.square(measurements.displacements) / np.maximum(measurements.num_measurements, 1.0)
-    variances = np.where(unknown, largest, problem.variances(state))
-    return replace(fit, covariance=problem.covariance(state, np.sqrt(variances)))
 
 
 # px, motion during an exposure; px and px/s, amplitude and drift; Hz. Fits beyond diverge: frames are smaller
