@@ -16,8 +16,7 @@ whether it is accepted.
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import replace
 
 import numpy as np
 
@@ -37,19 +36,13 @@ from rsvib_torch.registration.register import fits_frame
 from rsvib_torch.results.reason import Reason
 
 
-@dataclass(frozen=True)
-class FieldOptions:
-    """Whether roll and zoom are measured (True, False or ``"auto"``), and the camera in row order."""
-
-    roll: bool | Literal["auto"]  # rotation about the optical axis
-    zoom: bool | Literal["auto"]  # change of scale; includes roll
-    camera: Camera | None  # focal length and lens; None for an infinite focal length
-
-
 def detect_tones(
-    stacks: GreyFrames, timing: SensorTiming, options: DetectionOptions, field: FieldOptions
+    stacks: GreyFrames, timing: SensorTiming, options: DetectionOptions, axes: tuple[int, int], camera: Camera | None
 ) -> DetectionResult:
-    """Detect the tones of B stacks, with as many components as were requested or as the frames require."""
+    """Detect the tones of B stacks, with as many components as were requested or as the frames require.
+
+    ``axes`` are the numbers of components that are measured in any case, and at most; the camera is in row order.
+    """
     height, width = stacks.images.shape[-2:]
     row_timing, num_frames = timing.in_row_order(), stacks.images.shape[1]
 
@@ -58,24 +51,23 @@ def detect_tones(
 
     # 2. Roll and zoom, if they may be the cause of what the translation of any stack does not explain. A requested
     # component is measured in any case; frames that are too narrow for strips of columns are refused by an error then.
-    least_axes = 4 if field.zoom is True else 3 if field.roll is True else 2
-    most_axes = 4 if field.zoom else 3 if field.roll else 2
+    least_axes, most_axes = axes
     refined = translation.fitted.refined
-    requested = field.camera is not None or least_axes > 2
+    requested = camera is not None or least_axes > 2
     possible = False
     if refined is not None and most_axes > 2 and strips_fit(height, width, options.bands):
         possible = bool(rotation_possible(refined.other_motion, refined.uneven, height / width).any())
     if requested or possible:
         hypothesis = Hypothesis(
-            FieldScale(most_axes, width, height, field.camera),
+            FieldScale(most_axes, width, height, camera),
             is_doubtful=not requested,
             translation=translation.fit,
         )
         rotation = attempt(stacks, row_timing, options, hypothesis)
         if requested or not rotation.abandoned.all():  # parallax otherwise
-            axes = _moving_axes(rotation, least_axes)
-            if requested or axes > 2:
-                return _assembled(rotation, timing, num_frames).with_axes(axes)
+            moving = _moving_axes(rotation, least_axes)
+            if requested or moving > 2:
+                return _assembled(rotation, timing, num_frames).with_axes(moving)
 
     # 3. The same vibration of both halves.
     translation = _without_parallax(stacks, row_timing, options, translation)

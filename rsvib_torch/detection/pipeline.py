@@ -106,6 +106,12 @@ class Attempt:
         refined = self.fitted.refined
         return np.zeros_like(self.fit.centre, dtype=bool) if refined is None else refined.abandoned
 
+    @property
+    def visible(self) -> Array:
+        """(B,) bool, stacks of which rows or bands were measured."""
+        refined = self.fitted.refined
+        return np.ones_like(self.fit.centre, dtype=bool) if refined is None else refined.other_motion.measured > 0
+
 
 def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hypothesis: Hypothesis) -> Attempt:
     """Detect the vibration of B stacks under a hypothesis; the sensor is in row order."""
