@@ -42,9 +42,6 @@ class Measurements:
     independent: float | Array = 1.0
     # groups of frames whose rows follow each other: rows N / groups apart show the same part of the scene
     groups: int = 1
-    # (B, N, G, A, Q) vectors v over the frames of each row; displacements and models are multiplied by 1 - sum v v^T,
-    # which weakens errors that have their direction. None for none
-    weakened: Array | None = None
 
     @cached_property
     def _mean_weights(self) -> Array:
@@ -147,7 +144,6 @@ class Measurements:
             displacements=self.displacements[..., axis : axis + 1],
             information=self.inverse_variances[..., axis, None, None],
             average_times=(self.average_times[axis % 2 if axis < 2 else 0],) * 2,
-            weakened=None if self.weakened is None else self.weakened[..., axis : axis + 1, :],
         )
 
     def scaled(self, factor: Array) -> "Measurements":
@@ -165,9 +161,6 @@ class Measurements:
         mean = np.einsum("bng,bng...->bn...", self._mean_weights, values)  # over the frames g
         relative: Array = values - mean[:, :, None]
         relative *= self.visible.reshape(*self.visible.shape, *(1,) * (values.ndim - 3))
-        if self.weakened is not None:
-            along = np.einsum("bngaq,bnga...->bnaq...", self.weakened, relative)
-            relative = relative - np.einsum("bngaq,bnaq...->bnga...", self.weakened, along)
         return relative
 
     # Residuals of a fit, (B, N, G, 2) px

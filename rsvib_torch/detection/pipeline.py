@@ -21,20 +21,16 @@ from rsvib_torch.detection.start import BandStart, FieldScale, band_start, field
 from rsvib_torch.detection.tones.fit import (
     ToneFit,
     displacement_std,
-    fit_tones,
-    fitted_again,
     motion_of_fit,
     residual_of,
     shrunk,
     tone_displacements,
-    with_errors_of_blocks,
 )
-from rsvib_torch.detection.tones.selection import find_tones, robust_fit, too_small
+from rsvib_torch.detection.tones.selection import find_tones, robust_fit
 from rsvib_torch.detection.tones.uncertainty import (
     with_further_tones,
     with_unknown_amplitudes,
     with_unknown_image_motion,
-    with_weak_aliasing,
     without_aliasing,
 )
 from rsvib_torch.detection.verdict import Findings, compared_bands, judged, scene_reasons, with_reasons_of_all
@@ -132,18 +128,15 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
     # 2. Fit: tones and image motion, to the bands or to the rows.
     fitted = method.fit(start, stacks, timing, options, hypothesis)
 
-    # 3. Uncertainty: what the residual does not contain. A part of the scene has the same errors in all frames,
-    # aliasing biases the displacements, and the record may contain a further tone. The displacement is that of every
-    # eighth row of all frames.
+    # 3. Uncertainty: what the residual does not contain. Aliasing biases the displacements, and the record may contain
+    # a further tone. The displacement is that of every eighth row of all frames.
     intervals = compared_intervals(timing, num_frames, method.max_group_frames)
     row_starts = table(timing.row_starts(num_frames, height)[:, ::8].flatten())
     measurements, fit, refined = fitted.measurements, fitted.fit, fitted.refined
     if refined is not None:
-        measurements, fit = _with_errors_of_scene(refined, fitted.fit, intervals, timing)
-        small = too_small(fit, intervals, timing.exposure_time) & (fit.amplitude < fit.amplitude.max(-1, keepdims=True))
-        if options.max_tones < math.inf and small.any():  # aliasing was taken for further tones
-            kept = fit_tones(measurements, fit, fit.active & ~small)
-            measurements, fit = _with_errors_of_scene(refined, kept, intervals, timing)
+        fit = without_aliasing(measurements, fit, refined.aliasing)
+        unexplained, span = refined.other_motion.unexplained, measurements.span
+        fit = with_unknown_amplitudes(fit, refined.aliasing, unexplained, intervals, timing.exposure_time, span=span)
     known_std = displacement_std(fit, row_starts, timing.exposure_time)
     stated, if_hidden = with_further_tones(measurements, fit, row_starts, number_is_known=options.tones is not None)
     if refined is not None:
@@ -169,21 +162,6 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
         findings = tuple(with_reasons_of_all(of_scene, of_stack) for of_scene, of_stack in against)
     interval = float(intervals[0])
     return Attempt(options, scale, start, fitted, fit, vibration, std, std_if_hidden_tone, findings, interval)
-
-
-def _with_errors_of_scene(
-    refined: FittedRows, fit: ToneFit, intervals: Array, timing: RowTiming
-) -> tuple[Measurements, ToneFit]:
-    """The rows in which aliasing has less weight, and the fit with what it and the scene add to its uncertainty."""
-    measurements = with_weak_aliasing(refined.measurements, fit)
-    fit = fitted_again(measurements, fit)
-    fit = replace(fit, covariance=fit.covariance + refined.unknown)
-    fit = with_errors_of_blocks(measurements, fit)
-    fit = without_aliasing(measurements, fit, refined.aliasing)
-    unexplained = refined.other_motion.unexplained
-    return measurements, with_unknown_amplitudes(
-        fit, refined.aliasing, unexplained, intervals, timing.exposure_time, span=measurements.span
-    )
 
 
 def _band_offsets(start: BandStart, fit: ToneFit, options: DetectionOptions, height: int) -> dict[str, Array]:

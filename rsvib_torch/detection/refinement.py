@@ -218,8 +218,8 @@ class Refinement:
             of_tones = previous.frequencies, previous.active, previous.drift_order
             fit = robust_fit(measurements, *of_tones, residual, steps=1)[0]
         fit = self.fit = self._bounded(fit, previous)
-        same_tones = np.array_equal(previous.active, fit.active)
-        self._fits = [*self._fits, fit] if same_tones and number > self.search_round else [fit]
+        same_tones = number > self.search_round and np.array_equal(previous.active, fit.active)
+        self._fits = [*self._fits, fit] if same_tones else [fit]
         self.warped_by, self.around = self.around, shrunk(fit, self._intervals)
         self._gradients = measured.gradients
 
@@ -235,8 +235,7 @@ class Refinement:
         # 4. Settled stacks: the next round would change the motion by much less than its standard deviation, or the
         # residual of an axis that is refused hardly decreases.
         self._step = Step.between(measurements, self.warped_by, self.around)
-        converged = is_converged(previous, fit, self._acceleration.ratio(self._step) if same_tones else None)
-        converged = converged & (number >= self.search_round)
+        converged = is_converged(previous, fit) & (number >= self.search_round)
         self._stalled = self._refused_for_good(measured)
         self.converged = np.all(converged, -1)
         self.settled = np.all(converged | self._stalled, -1) & ~self.ended

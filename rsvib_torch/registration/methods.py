@@ -22,8 +22,8 @@ LAGS = 4  # px, reach of a fine correlation surface to either side: 9 samples fi
 
 
 def template_margin(search: int) -> int:
-    """Columns kept free on either side of a template, so that no lag of a search range in px leaves the frame."""
-    return search + LAGS
+    """Columns kept free on either side of a template: no lag of a search range in px leaves the frame."""
+    return search + 2 * LAGS
 
 
 @dataclass(frozen=True, eq=False)
