@@ -169,31 +169,28 @@ def _diagnosis(
     """
     num_frames, height, width = stack.images.shape[1:]
 
-    # 1. The candidates, each with the frequencies of one tone of each axis if they are known. The rows of a frame and
-    # the phase from frame to frame agree with one period of the frames.
-    candidates: list[tuple[SensorTiming, Array | None]] = []
+    # 1. The candidates. The rows of a frame and the phase from frame to frame agree with one period of the frames.
+    candidates: list[SensorTiming] = []
     measurements = take_stacks([found.fitted.measurements], np.array([index]))
-    agreeing = period_factor(measurements, timing.in_row_order(), num_frames) if num_frames > 2 else None
-    if agreeing is not None:
-        factor, tones = agreeing
+    factor = period_factor(measurements, timing.in_row_order(), num_frames) if num_frames > 2 else None
+    if factor is not None:
         if factor < 0:
             is_forward = timing.readout_direction == "forward"
-            candidates.append((replace(timing, readout_direction="reverse" if is_forward else "forward"), tones))
+            candidates.append(replace(timing, readout_direction="reverse" if is_forward else "forward"))
         elif timing.frame_start_times is not None:
             times = {name: getattr(timing, name) * factor for name in ("frame_rows", "exposure_rows")}
-            candidates.append((replace(timing, row_time=timing.row_time / factor, **times), tones))
+            candidates.append(replace(timing, row_time=timing.row_time / factor, **times))
         elif factor * timing.frame_rows >= max(height, timing.exposure_rows):
-            candidates.append((replace(timing, frame_rows=factor * timing.frame_rows), tones))
+            candidates.append(replace(timing, frame_rows=factor * timing.frame_rows))
     # With the wrong scan axis, the halves of a row are exposed at different times and move apart.
     if rotates and width <= timing.frame_rows and fits_frame(width, height, found.options.bands):
-        candidates.append((replace(timing, scan_axis="x" if timing.scan_axis == -2 else "y"), None))
+        candidates.append(replace(timing, scan_axis="x" if timing.scan_axis == -2 else "y"))
 
     # 2. The first one with which detection is reliable along the axes that contradict the stated timing.
-    for candidate, known in candidates:
+    for candidate in candidates:
         turned = stack.with_timing(candidate)
         scale = FieldScale(2, turned.images.shape[-1], turned.images.shape[-2])
-        hypothesis = Hypothesis(scale, is_doubtful=True, frequencies=known)
-        other = attempt(turned, candidate.in_row_order(), found.options, hypothesis)
+        other = attempt(turned, candidate.in_row_order(), found.options, Hypothesis(scale, is_doubtful=True))
         concerned = axes if candidate.scan_axis == timing.scan_axis else axes[::-1]
         refused = any(against and axis for against, axis in zip(other.findings[0], concerned, strict=True))
         if not other.abandoned[0] and not refused:
@@ -226,7 +223,7 @@ _ITERATIONS = 5  # of fits; most factors are wrong, and their fits converge slow
 _MINIMA, _EQUAL = 4, 4.0  # minima that are refined, and their squared residual over the least to count as equal
 
 
-def period_factor(measurements: Measurements, timing: RowTiming, num_frames: int) -> tuple[float, Array] | None:
+def period_factor(measurements: Measurements, timing: RowTiming, num_frames: int) -> float | None:
     """Factor c of the frame start times with which one tone along each axis explains the measurements best.
 
     A row ``i`` of frame ``p`` starts its exposure at ``c s_p + i row_time``: the rows of a frame and the phase from
@@ -234,8 +231,7 @@ def period_factor(measurements: Measurements, timing: RowTiming, num_frames: int
     vibration in reversed time is a vibration. The measurements are those of one stack of at least three frames.
 
     Returns:
-        c, 0.8 to 1.5, or -1, and the frequencies (1, 2, 1) in Hz of the tones; None if none explains the displacements
-        clearly better than 1.
+        c, 0.8 to 1.5, or -1; None if none explains the displacements clearly better than 1.
     """
     starts = table(timing.frame_starts(num_frames))
     interval = max(BLOCK_ROWS * timing.row_time, 0.5 * timing.exposure_time)
@@ -257,9 +253,9 @@ def period_factor(measurements: Measurements, timing: RowTiming, num_frames: int
     # 1. The stated timing, reversed readout, and other frame periods on a coarse grid.
     coarse = np.arange(_SHORTEST, _LONGEST, _STEP)
     sizes, frequencies = fits(np.concatenate([[1.0, -1.0], coarse]), _ROWS[0])
-    (stated, reverse), reversed_tones, sizes, frequencies = sizes[:2], frequencies[1:2], sizes[2:], frequencies[2:]
+    (stated, reverse), sizes, frequencies = sizes[:2], sizes[2:], frequencies[2:]
     if reverse < min(sizes.min(), _SMALLER * stated):
-        return -1.0, reversed_tones
+        return -1.0
     # 2. The best minima of the grid, each refined in steps four times smaller.
     inner = (sizes[1:-1] < sizes[:-2]) & (sizes[1:-1] < sizes[2:])
     minima = sorted(np.flatnonzero(inner) + 1, key=sizes.__getitem__)[:_MINIMA]
@@ -280,4 +276,4 @@ def period_factor(measurements: Measurements, timing: RowTiming, num_frames: int
     chosen = int(distance.argmin())
     if least[chosen] >= _SMALLER * stated:
         return None
-    return float(factors[chosen]), frequencies[chosen : chosen + 1]
+    return float(factors[chosen])

@@ -26,7 +26,7 @@ from rsvib_torch.detection.tones.fit import (
     shrunk,
     tone_displacements,
 )
-from rsvib_torch.detection.tones.selection import find_tones, robust_fit
+from rsvib_torch.detection.tones.selection import find_tones
 from rsvib_torch.detection.tones.uncertainty import (
     with_further_tones,
     with_unknown_amplitudes,
@@ -67,7 +67,6 @@ class Hypothesis:
     # if a large residual remains.
     is_doubtful: bool = False
     translation: ToneFit | None = None  # fit without roll and zoom, from which a fit with roll or zoom starts
-    frequencies: Array | None = None  # (B, A, 1) Hz of one tone of each axis
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,10 +119,6 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
         start = band_start(stacks, timing, options.bands, mere_start=not method.needs_whole_curve)
     else:
         start = field_start(stacks, timing, options.bands, scale, hypothesis.translation)
-    if hypothesis.frequencies is not None:
-        active = np.ones_like(hypothesis.frequencies, dtype=bool)
-        fit, _ = robust_fit(start.measurements, hypothesis.frequencies, active, options.drift_order)
-        start = replace(start, fit=fit)
 
     # 2. Fit: tones and image motion, to the bands or to the rows.
     fitted = method.fit(start, stacks, timing, options, hypothesis)
