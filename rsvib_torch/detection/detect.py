@@ -4,9 +4,8 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 from rsvib_torch.checks.arguments import FramesOrFiles
-from rsvib_torch.checks.values import check_choice
 from rsvib_torch.detection.attempts import detect_tones
-from rsvib_torch.detection.pipeline import METHODS, DetectionOptions
+from rsvib_torch.detection.pipeline import DetectionOptions
 from rsvib_torch.detection.result import DetectionResult
 from rsvib_torch.detection.start import camera_in_row_order
 from rsvib_torch.execution.parallel import full_precision, threads_for, without_gradients
@@ -69,8 +68,6 @@ def detect_vibration(frames: FramesOrFiles, timing: SensorTiming, options: Vibra
         >>> detection.reliable.tolist()
         [True, False]
     """
-    check_choice("method", options.method, tuple(METHODS))
-
     # 1. The user's frames become grey frames in row order.
     stacks = grey_frames(frames, timing, options)
     timing = stacks.timing

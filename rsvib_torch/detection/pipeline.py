@@ -7,7 +7,6 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -110,22 +109,21 @@ class Attempt:
 
 def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hypothesis: Hypothesis) -> Attempt:
     """Detect the vibration of B stacks under a hypothesis; the sensor is in row order."""
-    method, scale = METHODS[options.method], hypothesis.scale
-    frames = stacks.images
-    num_frames, height = frames.shape[1:3]
+    directly, scale = options.method == "direct", hypothesis.scale
+    num_frames, height = stacks.images.shape[1:3]
 
     # 1. Start: the offsets of row bands between consecutive frames, and the tones that are known.
     if scale.same_for_all_columns:
-        start = band_start(stacks, timing, options.bands, mere_start=not method.needs_whole_curve)
+        start = band_start(stacks, timing, options.bands, mere_start=directly)
     else:
         start = field_start(stacks, timing, options.bands, scale, hypothesis.translation)
 
     # 2. Fit: tones and image motion, to the bands or to the rows.
-    fitted = method.fit(start, stacks, timing, options, hypothesis)
+    fitted = fit_directly(start, stacks, timing, options, hypothesis) if directly else fit_bands(start, timing, options)
 
     # 3. Uncertainty: what the residual does not contain. Aliasing biases the displacements, and the record may contain
     # a further tone. The displacement is that of every eighth row of all frames.
-    intervals = compared_intervals(timing, num_frames, method.max_group_frames)
+    intervals = compared_intervals(timing, num_frames, MAX_GROUP_FRAMES if directly else 2)
     row_starts = table(timing.row_starts(num_frames, height)[:, ::8].flatten())
     measurements, fit, refined = fitted.measurements, fitted.fit, fitted.refined
     if refined is not None:
@@ -172,23 +170,7 @@ def _band_offsets(start: BandStart, fit: ToneFit, options: DetectionOptions, hei
 # Methods of detection
 
 
-@dataclass(frozen=True)
-class Method:
-    """A method of detection.
-
-    Its function has the start with the offset curve (B, P, N) of row bands, the grey frames (B, T, H, W) and the sensor
-    in row order, the options, and the hypothesis. Stacks of a batch have the same components and groups of frames, and
-    must not affect each other otherwise.
-    """
-
-    fit: Callable[[BandStart, GreyFrames, RowTiming, DetectionOptions, Hypothesis], Fitted]  # the function
-    max_group_frames: int  # number of frames that are compared with each other; it decides which tones have a gain
-    needs_whole_curve: bool  # whether the accuracy depends on the offset curve, or the curve is only a start
-
-
-def fit_bands(
-    start: BandStart, stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hypothesis: Hypothesis
-) -> Fitted:
+def fit_bands(start: BandStart, timing: RowTiming, options: DetectionOptions) -> Fitted:
     """The paper's method: tones are fitted to the offsets of row bands."""
     fit = _tones_of_bands(start, timing, options)
     weighted = start.measurements.reweighted(residual_of(start.measurements, fit))
@@ -238,9 +220,3 @@ def _tones_of_bands(start: BandStart, timing: RowTiming, options: DetectionOptio
     blind = table(blind_frequencies(timing, 0.5 / interval))
     chosen = options.tones, options.drift_order
     return find_tones(start.measurements, interval, *chosen, start=start.fit, blind=blind, accuracy=accuracy)
-
-
-METHODS: dict[DetectionMethod, Method] = {
-    "direct": Method(fit_directly, MAX_GROUP_FRAMES, needs_whole_curve=False),
-    "bands": Method(fit_bands, 2, needs_whole_curve=True),
-}
