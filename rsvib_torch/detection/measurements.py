@@ -248,8 +248,8 @@ class Measurements:
         """(B,) correction (0 to 1) of the number of measurements after ``reweighted``, for the covariance of the fit.
 
         Weights that depend on the residuals make these look smaller than the errors are: the variance of an M-estimator
-        is ``E psi^2 / (E psi')^2`` with ``psi = w z``, not ``E w z^2 / E w`` (Huber 1981, ch. 6). Of 118 parameters, the rms
-        error over the standard deviation is 1.12 with it and 1.18 without.
+        is ``E psi^2 / (E psi')^2`` with ``psi = w z``, not ``E w z^2 / E w`` (Huber 1981, ch. 6). Of 118
+        parameters, the rms error over the standard deviation is 1.12 with it and 1.18 without.
         """
         z = self._biweight_argument(residual)
         weight = np.square(1 - np.square(z))
