@@ -114,7 +114,7 @@ class ProjectionOptions:
 class ToneOptions(ProjectionOptions, RegistrationOptions):
     """Detection of tones."""
 
-    method: Annotated[DetectionMethod, Extensible] = "direct"
+    method: DetectionMethod = "direct"
     """``"direct"``, or ``"bands"`` (of the paper), in half the time with ten times larger errors."""
     tones: Annotated[int, Field(ge=1, le=MAX_TONES)] | Literal["auto"] = "auto"
     """Number of tones of each axis, 1 to 4, or ``"auto"`` to select it by significance; the standard deviations then

@@ -9,9 +9,8 @@ from typing import get_args
 import pytest
 
 import rsvib_torch as rsv
-from rsvib_torch.detection import pipeline
 from rsvib_torch.motion import recorded
-from rsvib_torch.options import METHOD_OPTIONS, DetectionMethod, MotionUnit, PriorName, Registration
+from rsvib_torch.options import METHOD_OPTIONS, MotionUnit, PriorName, Registration
 from rsvib_torch.registration.methods import BAND_METHODS
 from rsvib_torch.restoration.priors import PRIORS
 from rsvib_torch.restoration.restore import METHODS
@@ -75,7 +74,6 @@ def test_names_of_options_are_those_of_the_tables():
     assert list(METHOD_OPTIONS) == list(METHODS)
     assert set(get_args(PriorName)) == set(PRIORS)
     assert set(get_args(Registration)) == set(BAND_METHODS)
-    assert set(get_args(DetectionMethod)) == set(pipeline.METHODS)
     assert set(get_args(MotionUnit)) == {"px", *recorded._RADIANS}
 
 

@@ -16,8 +16,7 @@ whether it is accepted.
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import replace
 
 import numpy as np
 
@@ -37,19 +36,13 @@ from rsvib_torch.registration.register import fits_frame
 from rsvib_torch.results.reason import Reason
 
 
-@dataclass(frozen=True)
-class FieldOptions:
-    """Whether roll and zoom are measured (True, False or ``"auto"``), and the camera in row order."""
-
-    roll: bool | Literal["auto"]  # rotation about the optical axis
-    zoom: bool | Literal["auto"]  # change of scale; includes roll
-    camera: Camera | None  # focal length and lens; None for an infinite focal length
-
-
 def detect_tones(
-    stacks: GreyFrames, timing: SensorTiming, options: DetectionOptions, field: FieldOptions
+    stacks: GreyFrames, timing: SensorTiming, options: DetectionOptions, axes: tuple[int, int], camera: Camera | None
 ) -> DetectionResult:
-    """Detect the tones of B stacks, with as many components as were requested or as the frames require."""
+    """Detect the tones of B stacks, with as many components as were requested or as the frames require.
+
+    ``axes`` are the numbers of components that are measured in any case, and at most; the camera is in row order.
+    """
     height, width = stacks.images.shape[-2:]
     row_timing, num_frames = timing.in_row_order(), stacks.images.shape[1]
 
@@ -58,25 +51,23 @@ def detect_tones(
 
     # 2. Roll and zoom, if they may be the cause of what the translation of any stack does not explain. A requested
     # component is measured in any case; frames that are too narrow for strips of columns are refused by an error then.
-    least_axes = 4 if field.zoom is True else 3 if field.roll is True else 2
-    most_axes = 4 if field.zoom else 3 if field.roll else 2
+    least_axes, most_axes = axes
     refined = translation.fitted.refined
-    requested = field.camera is not None or least_axes > 2
+    requested = camera is not None or least_axes > 2
     possible = False
     if refined is not None and most_axes > 2 and strips_fit(height, width, options.bands):
         possible = bool(rotation_possible(refined.other_motion, refined.uneven, height / width).any())
     if requested or possible:
         hypothesis = Hypothesis(
-            FieldScale(most_axes, width, height, field.camera),
+            FieldScale(most_axes, width, height, camera),
             is_doubtful=not requested,
-            has_pattern=refined is not None and refined.has_pattern,
             translation=translation.fit,
         )
         rotation = attempt(stacks, row_timing, options, hypothesis)
         if requested or not rotation.abandoned.all():  # parallax otherwise
-            axes = _moving_axes(rotation, least_axes)
-            if requested or axes > 2:
-                return _assembled(rotation, timing, num_frames).with_axes(axes)
+            moving = _moving_axes(rotation, least_axes)
+            if requested or moving > 2:
+                return _assembled(rotation, timing, num_frames).with_axes(moving)
 
     # 3. The same vibration of both halves.
     translation = _without_parallax(stacks, row_timing, options, translation)
@@ -177,37 +168,29 @@ def _diagnosis(
     ``axes`` (x, y) in row order contradict the stated one; ``rotates``: whether the halves of the rows move apart.
     """
     num_frames, height, width = stack.images.shape[1:]
-    only = slice(index, index + 1)
 
-    # 1. The candidates, each with the frequencies of one tone of each axis if they are known. The rows of a frame and
-    # the phase from frame to frame agree with one period of the frames.
-    candidates: list[tuple[SensorTiming, Array | None]] = []
+    # 1. The candidates. The rows of a frame and the phase from frame to frame agree with one period of the frames.
+    candidates: list[SensorTiming] = []
     measurements = take_stacks([found.fitted.measurements], np.array([index]))
-    agreeing = period_factor(measurements, timing.in_row_order(), num_frames) if num_frames > 2 else None
-    if agreeing is not None:
-        factor, tones = agreeing
+    factor = period_factor(measurements, timing.in_row_order(), num_frames) if num_frames > 2 else None
+    if factor is not None:
         if factor < 0:
             is_forward = timing.readout_direction == "forward"
-            candidates.append((replace(timing, readout_direction="reverse" if is_forward else "forward"), tones))
+            candidates.append(replace(timing, readout_direction="reverse" if is_forward else "forward"))
         elif timing.frame_start_times is not None:
             times = {name: getattr(timing, name) * factor for name in ("frame_rows", "exposure_rows")}
-            candidates.append((replace(timing, row_time=timing.row_time / factor, **times), tones))
+            candidates.append(replace(timing, row_time=timing.row_time / factor, **times))
         elif factor * timing.frame_rows >= max(height, timing.exposure_rows):
-            candidates.append((replace(timing, frame_rows=factor * timing.frame_rows), tones))
+            candidates.append(replace(timing, frame_rows=factor * timing.frame_rows))
     # With the wrong scan axis, the halves of a row are exposed at different times and move apart.
     if rotates and width <= timing.frame_rows and fits_frame(width, height, found.options.bands):
-        candidates.append((replace(timing, scan_axis="x" if timing.scan_axis == -2 else "y"), None))
+        candidates.append(replace(timing, scan_axis="x" if timing.scan_axis == -2 else "y"))
 
     # 2. The first one with which detection is reliable along the axes that contradict the stated timing.
-    for candidate, known in candidates:
-        turned, curve, bands = stack, found.start.curve, None
-        if (candidate.scan_axis, candidate.readout_direction) == (timing.scan_axis, timing.readout_direction):
-            bands = replace(curve, offsets=curve.offsets[only], quality=curve.quality[only])
-        else:
-            turned = stack.with_timing(candidate)
+    for candidate in candidates:
+        turned = stack.with_timing(candidate)
         scale = FieldScale(2, turned.images.shape[-1], turned.images.shape[-2])
-        hypothesis = Hypothesis(scale, is_doubtful=True, known_offsets=bands, frequencies=known)
-        other = attempt(turned, candidate.in_row_order(), found.options, hypothesis)
+        other = attempt(turned, candidate.in_row_order(), found.options, Hypothesis(scale, is_doubtful=True))
         concerned = axes if candidate.scan_axis == timing.scan_axis else axes[::-1]
         refused = any(against and axis for against, axis in zip(other.findings[0], concerned, strict=True))
         if not other.abandoned[0] and not refused:
@@ -240,7 +223,7 @@ _ITERATIONS = 5  # of fits; most factors are wrong, and their fits converge slow
 _MINIMA, _EQUAL = 4, 4.0  # minima that are refined, and their squared residual over the least to count as equal
 
 
-def period_factor(measurements: Measurements, timing: RowTiming, num_frames: int) -> tuple[float, Array] | None:
+def period_factor(measurements: Measurements, timing: RowTiming, num_frames: int) -> float | None:
     """Factor c of the frame start times with which one tone along each axis explains the measurements best.
 
     A row ``i`` of frame ``p`` starts its exposure at ``c s_p + i row_time``: the rows of a frame and the phase from
@@ -248,8 +231,7 @@ def period_factor(measurements: Measurements, timing: RowTiming, num_frames: int
     vibration in reversed time is a vibration. The measurements are those of one stack of at least three frames.
 
     Returns:
-        c, 0.8 to 1.5, or -1, and the frequencies (1, 2, 1) in Hz of the tones; None if none explains the displacements
-        clearly better than 1.
+        c, 0.8 to 1.5, or -1; None if none explains the displacements clearly better than 1.
     """
     starts = table(timing.frame_starts(num_frames))
     interval = max(BLOCK_ROWS * timing.row_time, 0.5 * timing.exposure_time)
@@ -271,9 +253,9 @@ def period_factor(measurements: Measurements, timing: RowTiming, num_frames: int
     # 1. The stated timing, reversed readout, and other frame periods on a coarse grid.
     coarse = np.arange(_SHORTEST, _LONGEST, _STEP)
     sizes, frequencies = fits(np.concatenate([[1.0, -1.0], coarse]), _ROWS[0])
-    (stated, reverse), reversed_tones, sizes, frequencies = sizes[:2], frequencies[1:2], sizes[2:], frequencies[2:]
+    (stated, reverse), sizes, frequencies = sizes[:2], sizes[2:], frequencies[2:]
     if reverse < min(sizes.min(), _SMALLER * stated):
-        return -1.0, reversed_tones
+        return -1.0
     # 2. The best minima of the grid, each refined in steps four times smaller.
     inner = (sizes[1:-1] < sizes[:-2]) & (sizes[1:-1] < sizes[2:])
     minima = sorted(np.flatnonzero(inner) + 1, key=sizes.__getitem__)[:_MINIMA]
@@ -294,4 +276,4 @@ def period_factor(measurements: Measurements, timing: RowTiming, num_frames: int
     chosen = int(distance.argmin())
     if least[chosen] >= _SMALLER * stated:
         return None
-    return float(factors[chosen]), frequencies[chosen : chosen + 1]
+    return float(factors[chosen])

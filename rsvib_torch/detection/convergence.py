@@ -18,6 +18,7 @@ from rsvib_torch.numerics.tables import Array, split_axis
 
 _KEPT = 4  # steps that are combined; more change results of long exposures by less than their standard deviations
 _MAX_EXTRAPOLATION = 4.0  # steps
+_SMALL_CHANGE = 0.5  # standard deviations
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,12 +35,11 @@ class Step:
         return cls(after, after - before)
 
 
-def is_converged(previous: ToneFit, fit: ToneFit, ratio: Array | None) -> Array:
+def is_converged(previous: ToneFit, fit: ToneFit) -> Array:
     """(B, A) bool, whether the last round changed the tones of an axis so little that the next one need not be made.
 
     Without long exposures a step is a tenth of the previous one or shorter. Changes of up to half a standard deviation
-    are therefore small enough, and up to three standard deviations if the measured ratio (B,) of the last two steps
-    allows it.
+    are therefore small enough.
     """
     if previous.active.shape != fit.active.shape:
         return np.zeros_like(fit.active[..., 0])
@@ -47,12 +47,8 @@ def is_converged(previous: ToneFit, fit: ToneFit, ratio: Array | None) -> Array:
     deviation = np.sqrt(np.maximum(split_axis(deviation, -1, fit.coefficients.shape[1], -1), 0.0))
     std = split_axis(deviation[..., : 3 * fit.frequencies.shape[-1]], -1, -1, 3)  # of Re C, Im C and f
     change = np.abs(previous.about(fit.centre).coefficients - fit.coefficients)
-    max_change_std = np.array(0.5)
-    if ratio is not None:
-        max_change_std = np.clip(0.08 / np.maximum(ratio, 1e-3), 0.5, 3.0)[:, None, None]
-    small = (change <= max_change_std * std[..., :2].max(-1)) & (
-        np.abs(previous.frequencies - fit.frequencies) <= max_change_std * std[..., 2]
-    )
+    same_frequency = np.abs(previous.frequencies - fit.frequencies) <= _SMALL_CHANGE * std[..., 2]
+    small = (change <= _SMALL_CHANGE * std[..., :2].max(-1)) & same_frequency
     return (small | ~fit.active).all(-1)
 
 
@@ -66,13 +62,6 @@ class Acceleration:
     """
 
     steps: list[Step] = field(default_factory=list)  # the last steps with the same tones
-
-    def ratio(self, step: Step) -> Array | None:
-        """(B,) length of a step over the length of the last one; None if there is none."""
-        if not self.steps:
-            return None
-        square, previous_square = (np.square(one.change).sum((1, 2, 3)) for one in (step, self.steps[-1]))
-        return np.sqrt(square / np.maximum(previous_square, 1e-30))
 
     def add(self, step: Step, *, same_tones: bool) -> None:
         """Keep a step; steps with other tones do not predict the next one."""

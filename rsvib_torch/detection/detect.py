@@ -4,9 +4,8 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 from rsvib_torch.checks.arguments import FramesOrFiles
-from rsvib_torch.checks.values import check_choice
-from rsvib_torch.detection.attempts import FieldOptions, detect_tones
-from rsvib_torch.detection.pipeline import METHODS, DetectionOptions
+from rsvib_torch.detection.attempts import detect_tones
+from rsvib_torch.detection.pipeline import DetectionOptions
 from rsvib_torch.detection.result import DetectionResult
 from rsvib_torch.detection.start import camera_in_row_order
 from rsvib_torch.execution.parallel import full_precision, threads_for, without_gradients
@@ -69,8 +68,6 @@ def detect_vibration(frames: FramesOrFiles, timing: SensorTiming, options: Vibra
         >>> detection.reliable.tolist()
         [True, False]
     """
-    check_choice("method", options.method, tuple(METHODS))
-
     # 1. The user's frames become grey frames in row order.
     stacks = grey_frames(frames, timing, options)
     timing = stacks.timing
@@ -79,7 +76,7 @@ def detect_vibration(frames: FramesOrFiles, timing: SensorTiming, options: Vibra
     zoom = False if options.roll is False and options.zoom == "auto" else options.zoom  # zoom is measured with roll
     if options.roll is False and zoom:
         raise ValueError("zoom=True measures roll as well, and roll=False excludes it; pass roll=True, or zoom=False")
-    field = FieldOptions(options.roll, zoom, camera)
+    axes = 4 if zoom is True else 3 if options.roll is True else 2, 4 if zoom else 3 if options.roll else 2
     tones, drift_order = None if options.tones == "auto" else options.tones, 2 if options.image_acceleration else 1
     chosen = DetectionOptions(options.method, tones, drift_order, options)
     if options.columns is not None:
@@ -88,11 +85,11 @@ def detect_vibration(frames: FramesOrFiles, timing: SensorTiming, options: Vibra
                 f"columns={options.columns} goes with roll=False, zoom=False and focal_length=None: roll, zoom and "
                 "perspective are measured from all columns"
             )
-        stacks, field = stacks.narrowed(options.columns), FieldOptions(False, False, None)
+        stacks, axes = stacks.narrowed(options.columns), (2, 2)
 
     # 2. One result from all frames.
     with threads_for(stacks.images):
-        result = detect_tones(stacks, timing, chosen, field)
+        result = detect_tones(stacks, timing, chosen, axes, camera)
     return result if stacks.batched else result[0]
 
 

@@ -7,7 +7,6 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,21 +20,16 @@ from rsvib_torch.detection.start import BandStart, FieldScale, band_start, field
 from rsvib_torch.detection.tones.fit import (
     ToneFit,
     displacement_std,
-    fit_tones,
-    fitted_again,
     motion_of_fit,
     residual_of,
     shrunk,
     tone_displacements,
-    with_errors_of_blocks,
-    with_unknown_errors,
 )
-from rsvib_torch.detection.tones.selection import find_tones, robust_fit, too_small
+from rsvib_torch.detection.tones.selection import find_tones
 from rsvib_torch.detection.tones.uncertainty import (
     with_further_tones,
     with_unknown_amplitudes,
     with_unknown_image_motion,
-    with_weak_aliasing,
     without_aliasing,
 )
 from rsvib_torch.detection.verdict import Findings, compared_bands, judged, scene_reasons, with_reasons_of_all
@@ -71,10 +65,7 @@ class Hypothesis:
     # of the rows move apart, another timing because tones do not explain the rows. The attempt is then abandoned early
     # if a large residual remains.
     is_doubtful: bool = False
-    has_pattern: bool | None = None  # whether the frames have a pattern of columns; None if it is not known
     translation: ToneFit | None = None  # fit without roll and zoom, from which a fit with roll or zoom starts
-    known_offsets: OffsetCurve | None = None  # offsets of the row bands of these frames, measured with another timing
-    frequencies: Array | None = None  # (B, A, 1) Hz of one tone of each axis
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,39 +109,27 @@ class Attempt:
 
 def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hypothesis: Hypothesis) -> Attempt:
     """Detect the vibration of B stacks under a hypothesis; the sensor is in row order."""
-    method, scale = METHODS[options.method], hypothesis.scale
-    frames = stacks.images
-    num_frames, height = frames.shape[1:3]
+    directly, scale = options.method == "direct", hypothesis.scale
+    num_frames, height = stacks.images.shape[1:3]
 
     # 1. Start: the offsets of row bands between consecutive frames, and the tones that are known.
     if scale.same_for_all_columns:
-        known = hypothesis.known_offsets
-        start = band_start(stacks, timing, options.bands, known, mere_start=not method.needs_whole_curve)
+        start = band_start(stacks, timing, options.bands, mere_start=directly)
     else:
         start = field_start(stacks, timing, options.bands, scale, hypothesis.translation)
-    if hypothesis.frequencies is not None:
-        active = np.ones_like(hypothesis.frequencies, dtype=bool)
-        fit, _ = robust_fit(start.measurements, hypothesis.frequencies, active, options.drift_order)
-        start = replace(start, fit=fit)
 
     # 2. Fit: tones and image motion, to the bands or to the rows.
-    fitted = method.fit(start, stacks, timing, options, hypothesis)
+    fitted = fit_directly(start, stacks, timing, options, hypothesis) if directly else fit_bands(start, timing, options)
 
-    # 3. Uncertainty: what the residual does not contain. Fits with hardly more measurements than parameters are exact
-    # for any errors; a part of the scene has the same errors in all frames; aliasing biases the displacements; the
-    # record may contain a further tone. The displacement is that of every eighth row of all frames.
-    intervals = compared_intervals(timing, num_frames, method.max_group_frames)
+    # 3. Uncertainty: what the residual does not contain. Aliasing biases the displacements, and the record may contain
+    # a further tone. The displacement is that of every eighth row of all frames.
+    intervals = compared_intervals(timing, num_frames, MAX_GROUP_FRAMES if directly else 2)
     row_starts = table(timing.row_starts(num_frames, height)[:, ::8].flatten())
-    measurements = fitted.measurements
-    refined = fitted.refined
-    if refined is None:
-        fit = with_unknown_errors(measurements, fitted.fit)
-    else:
-        measurements, fit = _with_errors_of_scene(refined, fitted.fit, intervals, timing)
-        small = too_small(fit, intervals, timing.exposure_time) & (fit.amplitude < fit.amplitude.max(-1, keepdims=True))
-        if options.max_tones < math.inf and small.any():  # aliasing was taken for further tones
-            kept = fit_tones(measurements, fit, fit.active & ~small)
-            measurements, fit = _with_errors_of_scene(refined, kept, intervals, timing)
+    measurements, fit, refined = fitted.measurements, fitted.fit, fitted.refined
+    if refined is not None:
+        fit = without_aliasing(measurements, fit, refined.aliasing)
+        unexplained, span = refined.other_motion.unexplained, measurements.span
+        fit = with_unknown_amplitudes(fit, refined.aliasing, unexplained, intervals, timing.exposure_time, span=span)
     known_std = displacement_std(fit, row_starts, timing.exposure_time)
     stated, if_hidden = with_further_tones(measurements, fit, row_starts, number_is_known=options.tones is not None)
     if refined is not None:
@@ -178,21 +157,6 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
     return Attempt(options, scale, start, fitted, fit, vibration, std, std_if_hidden_tone, findings, interval)
 
 
-def _with_errors_of_scene(
-    refined: FittedRows, fit: ToneFit, intervals: Array, timing: RowTiming
-) -> tuple[Measurements, ToneFit]:
-    """The rows in which aliasing has less weight, and the fit with what it and the scene add to its uncertainty."""
-    measurements = with_weak_aliasing(refined.measurements, fit)
-    fit = fitted_again(measurements, fit)
-    fit = replace(fit, covariance=fit.covariance + refined.unknown)
-    fit = with_errors_of_blocks(measurements, fit)
-    fit = without_aliasing(measurements, fit, refined.aliasing)
-    unexplained = refined.other_motion.unexplained
-    return measurements, with_unknown_amplitudes(
-        fit, refined.aliasing, unexplained, intervals, timing.exposure_time, span=measurements.span
-    )
-
-
 def _band_offsets(start: BandStart, fit: ToneFit, options: DetectionOptions, height: int) -> dict[str, Array]:
     """``compared_bands`` of the offsets of the row bands and of those that a fit predicts."""
     (offsets, rows), predicted = tables(start.curve.offsets, start.curve.rows), start.predicted(fit)
@@ -206,23 +170,7 @@ def _band_offsets(start: BandStart, fit: ToneFit, options: DetectionOptions, hei
 # Methods of detection
 
 
-@dataclass(frozen=True)
-class Method:
-    """A method of detection.
-
-    Its function has the start with the offset curve (B, P, N) of row bands, the grey frames (B, T, H, W) and the sensor
-    in row order, the options, and the hypothesis. Stacks of a batch have the same components and groups of frames, and
-    must not affect each other otherwise.
-    """
-
-    fit: Callable[[BandStart, GreyFrames, RowTiming, DetectionOptions, Hypothesis], Fitted]  # the function
-    max_group_frames: int  # number of frames that are compared with each other; it decides which tones have a gain
-    needs_whole_curve: bool  # whether the accuracy depends on the offset curve, or the curve is only a start
-
-
-def fit_bands(
-    start: BandStart, stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hypothesis: Hypothesis
-) -> Fitted:
+def fit_bands(start: BandStart, timing: RowTiming, options: DetectionOptions) -> Fitted:
     """The paper's method: tones are fitted to the offsets of row bands."""
     fit = _tones_of_bands(start, timing, options)
     weighted = start.measurements.reweighted(residual_of(start.measurements, fit))
@@ -242,7 +190,7 @@ def fit_directly(
         frames = grouped_frames(stacks.images, stacks.valid, timing, motion)
     else:  # pairs take several times as long, and are not needed to find that there is no roll
         frames = grouped_strips(stacks.images, stacks.valid, timing, motion, scale, pairs=not doubtful)
-    refined = refine(frames, intervals, fit, options.tones, may_abandon=doubtful, has_pattern=hypothesis.has_pattern)
+    refined = refine(frames, intervals, fit, options.tones, may_abandon=doubtful)
     # Bands that move within their height contain twice the frequency of a tone, as a tone that is larger than the frame
     # if it is nearly blind (3 of 200 recordings in four and eight frames), or none (1 of 60 in two frames, with another
     # axis that was wrong): where the rows contradict the fit, one tone of each axis is tried.
@@ -260,8 +208,7 @@ def fit_directly(
         motion = motion_of_fit(shrunk(refined.fit, intervals), stacks.images.device)
         if not frames.suits(motion) or (doubtful and frames.differently_blurred(motion).any()):
             frames = grouped_strips(stacks.images, stacks.valid, timing, motion, scale)
-            again = refine(frames, intervals, refined.fit, options.tones, has_pattern=hypothesis.has_pattern)
-            refined = replace(again, abandoned=refined.abandoned)
+            refined = replace(refine(frames, intervals, refined.fit, options.tones), abandoned=refined.abandoned)
     group_frames = [group.size for group in refined.frames.groups for _ in range(group.count)]
     curve = offset_curve(refined.measurements, refined.fit, refined.robust_weights, group_frames, stacks.images.device)
     return Fitted(refined.fit, refined.measurements, *curve, refined)
@@ -273,9 +220,3 @@ def _tones_of_bands(start: BandStart, timing: RowTiming, options: DetectionOptio
     blind = table(blind_frequencies(timing, 0.5 / interval))
     chosen = options.tones, options.drift_order
     return find_tones(start.measurements, interval, *chosen, start=start.fit, blind=blind, accuracy=accuracy)
-
-
-METHODS: dict[DetectionMethod, Method] = {
-    "direct": Method(fit_directly, MAX_GROUP_FRAMES, needs_whole_curve=False),
-    "bands": Method(fit_bands, 2, needs_whole_curve=True),
-}

@@ -62,7 +62,6 @@ class FittedRows:
     aliasing: Array  # (B,) px, expected size of the bias of the displacements by aliasing
     uneven: Array  # (B, 2) px, differences of the displacements along a row that roll and zoom cannot explain
     frames: GroupedFrames  # the frames; without a pattern of columns if there was one
-    has_pattern: bool  # whether a pattern of columns was subtracted
     unknown: Array  # (B, A P, A P) covariance of what the last rounds changed; 0 for stacks that converged
     abandoned: Array  # (B,) bool, stacks whose large residual ended the rounds early
 
@@ -74,11 +73,10 @@ def refine(
     tones: int | None,
     *,
     may_abandon: bool = False,
-    has_pattern: bool | None = None,
 ) -> FittedRows:
     """Refine a motion of row bands on the images: the last measurements and the fit; arguments as in ``Refinement``."""
     # Rounds of measuring and fitting from the given start.
-    refined = _rounds(frames, intervals, start, tones, may_abandon, has_pattern)
+    refined = _rounds(frames, intervals, start, tones, may_abandon)
     # A long exposure can make the start choose the wrong side of a blind frequency: the other side is tried as well,
     # one axis after the other.
     device = frames.groups[0].starts.device
@@ -92,7 +90,7 @@ def refine(
         active, index = strongest_only(refined.fit).active, np.flatnonzero(mirrored.any(-1))
         other, _ = robust_fit(refined.measurements, frequencies, active, start.drift_order)
         # a pattern that was subtracted does not appear again
-        again = _rounds(refined.frames.stacks(index), intervals, take_stacks([other], index), tones, False, has_pattern)
+        again = _rounds(refined.frames.stacks(index), intervals, take_stacks([other], index), tones, False)
         refined = with_better(refined, again, index)
     # Tones that the exact fit does not confirm are left out.
     if tones is None:
@@ -110,10 +108,9 @@ def _rounds(
     start: ToneFit,
     tones: int | None,
     may_abandon: bool,
-    has_pattern: bool | None,
 ) -> FittedRows:
     """All rounds from a start: parts of the batch that are finished leave it, or begin again by themselves."""
-    running = [Refinement(frames, intervals, start, tones, may_abandon=may_abandon, has_pattern=has_pattern)]
+    running = [Refinement(frames, intervals, start, tones, may_abandon=may_abandon)]
     finished: list[Refinement] = []
     while running:
         refinement = running.pop()
@@ -135,13 +132,13 @@ def _joined(finished: list["Refinement"], frames: GroupedFrames) -> FittedRows:
     """The results of refinements of parts of a batch, whose frames are given, as one of all its stacks."""
     results = [refinement.result() for refinement in finished]
     # Frames without the patterns of columns that were subtracted.
-    patterns = [(refinement.stacks, part) for refinement in finished if (part := refinement.pattern) is not None]
-    for stacks, pattern in patterns:
-        frames = frames.without(pattern, stacks)
+    for refinement in finished:
+        if refinement.pattern is not None:
+            frames = frames.without(refinement.pattern, refinement.stacks)
     if len(results) == 1:
         return replace(results[0], frames=frames)
     order = np.concatenate([refinement.stacks for refinement in finished]).argsort()
-    return replace(_taken(results, order), frames=frames, has_pattern=bool(patterns))
+    return replace(_taken(results, order), frames=frames)
 
 
 def _taken(results: Sequence[FittedRows], index: Array) -> FittedRows:
@@ -160,8 +157,6 @@ class Refinement:
     ``intervals`` (M,) are the times in s between the frames that are compared; ``tones`` is the number of tones of each
     axis, None to select it by significance. ``may_abandon``: whether the motion is possibly of another kind than
     assumed (parallax instead of roll); stacks with a large residual after three rounds are then abandoned.
-    ``has_pattern``: whether the frames have a pattern of columns, which is then subtracted after the first round
-    instead of the last, or not looked for; None if it is not known.
     """
 
     def __init__(
@@ -172,7 +167,6 @@ class Refinement:
         tones: int | None,
         *,
         may_abandon: bool = False,
-        has_pattern: bool | None = None,
     ) -> None:
         self.frames, self.fit = frames, start  # without a pattern that was subtracted; the fit of the last round
         # the fits around whose motions the next round measures and the last one measured
@@ -184,8 +178,7 @@ class Refinement:
         # (B,) bool: stacks that no further round is permitted for, or would help; others that need none, unless a
         # pattern of columns is the cause; those whose next round would change little; those that are abandoned
         self.ended = self.settled = self.converged = self.abandoned = np.zeros_like(start.centre, dtype=bool)
-        self._intervals, self._tones = intervals, tones
-        self._may_abandon, self._has_pattern = may_abandon, has_pattern
+        self._intervals, self._tones, self._may_abandon = intervals, tones, may_abandon
         # exposures average out faster tones
         self._sample_interval = max(BLOCK_ROWS * frames.timing.row_time, 0.5 * frames.timing.exposure_time)
         self._blind = table(blind_frequencies(frames.timing, 0.5 / self._sample_interval))
@@ -196,7 +189,7 @@ class Refinement:
         self._stalled: Array  # (B, A) bool, after the last round
         self.pattern: Tensor | None = None  # (R, U) spectrum that was subtracted from the R rows of stacks or strips
         # a strong pattern biases its first estimate, so that it is subtracted twice
-        self._patterns_left = 0 if has_pattern is False else 2
+        self._patterns_left = 2
         self._refused: Array | None = None  # (B, A) residuals before a pattern was subtracted, if all axes were refused
         # of the rounds since the search: (B, A) typical residuals in standard deviations, and fits of the same tones
         self._sizes: list[Array] = []
@@ -225,8 +218,8 @@ class Refinement:
             of_tones = previous.frequencies, previous.active, previous.drift_order
             fit = robust_fit(measurements, *of_tones, residual, steps=1)[0]
         fit = self.fit = self._bounded(fit, previous)
-        same_tones = np.array_equal(previous.active, fit.active)
-        self._fits = [*self._fits, fit] if same_tones and number > self.search_round else [fit]
+        same_tones = number > self.search_round and np.array_equal(previous.active, fit.active)
+        self._fits = [*self._fits, fit] if same_tones else [fit]
         self.warped_by, self.around = self.around, shrunk(fit, self._intervals)
         self._gradients = measured.gradients
 
@@ -242,15 +235,10 @@ class Refinement:
         # 4. Settled stacks: the next round would change the motion by much less than its standard deviation, or the
         # residual of an axis that is refused hardly decreases.
         self._step = Step.between(measurements, self.warped_by, self.around)
-        converged = is_converged(previous, fit, self._acceleration.ratio(self._step) if same_tones else None)
-        converged = converged & (number >= self.search_round)
+        converged = is_converged(previous, fit) & (number >= self.search_round)
         self._stalled = self._refused_for_good(measured)
         self.converged = np.all(converged, -1)
         self.settled = np.all(converged | self._stalled, -1) & ~self.ended
-
-        # 5. Begin again without a pattern of columns that is known, as soon as the motion is known roughly.
-        if number == 0 and self._has_pattern and self.begins_again():
-            self.settled = np.zeros_like(self.settled)
 
     def begins_again(self) -> bool:
         """Subtract a pattern of columns and begin again; False if there is none, or if all axes are refused again."""
@@ -264,17 +252,12 @@ class Refinement:
         self.frames, self._gradients = self.frames.without(pattern), None
         self.pattern = pattern if self.pattern is None else self.pattern + pattern
         self._patterns_left, self._refused = self._patterns_left - 1, refused
-        self.converged = np.zeros_like(self.converged)
-        if self.round > 1:  # after the first round, the search is still to come
-            self.search_round = self.round
-            self._sizes = []
-            self._acceleration = Acceleration()
+        self.converged, self.search_round = np.zeros_like(self.converged), self.round
+        self._sizes, self._acceleration = [], Acceleration()
         return True
 
     def accelerate(self) -> None:
         """Accelerate the last step from the ones before; the gradients are kept where it is short."""
-        if self._gradients is None:  # it has just begun again
-            return
         measurements = self._measured.measurements
         self._acceleration.add(self._step, same_tones=len(self._fits) > 1)
         faster = self._acceleration.applied(measurements, self.fit)
@@ -315,8 +298,7 @@ class Refinement:
         permitted residual. The changes of the parameters by the last rounds count as errors of unknown sign: tones near
         blind frequencies with long exposures had errors of 4 to 18 standard deviations without them.
         """
-        fitted = conclude(self.frames, self._measured, self.fit)
-        fitted = replace(fitted, has_pattern=self.pattern is not None, abandoned=self.abandoned)
+        fitted = replace(conclude(self.frames, self._measured, self.fit), abandoned=self.abandoned)
         unknown = ~(self.converged | self.abandoned)
         if not bool(unknown.any()):
             return fitted
@@ -386,7 +368,6 @@ def conclude(frames: GroupedFrames, measured: MeasuredRows, fit: ToneFit) -> Fit
         aliasing=measured.aliasing(),
         uneven=measured.uneven(),
         frames=frames,
-        has_pattern=False,
         unknown=np.zeros_like(fit.covariance),
         abandoned=np.zeros_like(fit.centre, dtype=bool),
     )

@@ -180,16 +180,9 @@ class BandStart:
         return split_axis(displacements[:, :, 1] - displacements[:, :, 0], 1, *self.curve.quality.shape[1:])
 
 
-def band_start(
-    stacks: GreyFrames, timing: RowTiming, options: RegistrationOptions, known: OffsetCurve | None, *, mere_start: bool
-) -> BandStart:
-    """``band_curve`` with its measurements; ``known`` are the offsets of these frames with another timing."""
-    if known is None:
-        curve = band_curve(stacks.images, stacks.valid, timing, options, mere_start=mere_start)
-    else:
-        starts = timing.frame_starts(stacks.images.shape[1], stacks.images.device)
-        times = starts[:, None] + known.rows * timing.row_time
-        curve = replace(known, times=times[:-1], later_times=times[1:])
+def band_start(stacks: GreyFrames, timing: RowTiming, options: RegistrationOptions, *, mere_start: bool) -> BandStart:
+    """``band_curve`` with its measurements."""
+    curve = band_curve(stacks.images, stacks.valid, timing, options, mere_start=mere_start)
     return BandStart(curve, measurements_of_curve(curve, timing, options.band_step))
 
 

@@ -18,13 +18,12 @@ from rsvib_torch.execution.parallel import chunks, in_parallel
 from rsvib_torch.numerics.interpolation import fast_length
 from rsvib_torch.numerics.tables import Array, table, tensor
 
-BINNING = 4  # columns that are averaged in the search for whole pixels; a parabola recovers the single pixel
 LAGS = 4  # px, reach of a fine correlation surface to either side: 9 samples fix the peak to 0.001 px (subpixel_peak)
 
 
 def template_margin(search: int) -> int:
-    """Columns kept free on either side of a template, so that no lag of a search range in px leaves the frame."""
-    return search + LAGS + BINNING
+    """Columns kept free on either side of a template: no lag of a search range in px leaves the frame."""
+    return search + 2 * LAGS
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,29 +90,13 @@ def _at_edge(place: Tensor, surface: Tensor) -> Tensor:
     return ((place == 0) | (place == last)).any(-1)
 
 
-def whole_pixel_peak(surface: Tensor, factor: int) -> tuple[Tensor, Tensor]:
-    """Whole-pixel lags (L, N, 2) in (x, y) of the peaks of surfaces (L, N, A, B), and whether they are inside (L, N).
-
-    The columns count ``factor`` pixels each; a parabola through three columns gives the single pixel.
-    """
-    flat = surface.flatten(0, 1)
-    place, value = integer_peak(flat)
-    around = cut_lags(flat, place, (0, 1))[:, 0]
-    bend = around[:, 2] - 2 * around[:, 1] + around[:, 0]
-    fraction = torch.where(bend < 0, 0.5 * (around[:, 0] - around[:, 2]) / bend.clamp(max=-1e-12), 0.0)
-    x = ((place[:, 1] - flat.shape[-1] // 2 + fraction.clamp(-0.5, 0.5)) * factor).round().long()
-    y = place[:, 0] - flat.shape[-2] // 2
-    inside = ~_at_edge(place, flat) & (value > 0)
-    return torch.stack([x, y], -1).unflatten(0, surface.shape[:2]), inside.unflatten(0, surface.shape[:2])
-
-
 def fine_offsets(task: BandTask, shift: Tensor, surface: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-    """Offsets (L, N, 2) and quality (L, N) of ``valid`` bands from surfaces of the lags within LAGS around shifts."""
+    """Offsets (L, N, 2) and quality (L, N) of ``valid`` bands from surfaces of lags around whole-pixel shifts."""
     flat = surface.flatten(0, 1)
     place, _ = integer_peak(flat)
     # the peak comes to the centre, so that it has neighbours on every side to interpolate from
     position, value = subpixel_peak(cut_lags(flat, place, (LAGS - 1, LAGS - 1)))
-    fine = (position + place - LAGS).flip(-1).unflatten(0, valid.shape)
+    fine = (position + place - surface.shape[-1] // 2).flip(-1).unflatten(0, valid.shape)
     offsets = shift + fine
     good = valid & ~_at_edge(place, flat).unflatten(0, valid.shape) & torch.isfinite(fine).all(-1)
     good = good & ((offsets - task.start).abs() < task.search).all(-1)
@@ -163,27 +146,20 @@ def subpixel_peak(surface: Tensor) -> tuple[Tensor, Tensor]:
     return peaks[:, :2], peaks[:, 2]
 
 
-def _whole_pixels(task: BandTask) -> tuple[Tensor, Tensor]:
-    """Whole-pixel shifts (L, N, 2) of bands by cross-correlation of binned columns, and whether they are known (L, N).
+def _search(task: BandTask) -> tuple[Tensor, Tensor, Tensor]:
+    """Cross-correlation of bands over the search range (L, N, A, B), and the whole pixels of its peaks.
 
-    All methods begin with it: the profiles of a band are too short for the search range across the rows.
+    All methods begin with it: the profiles of a band are too short for the search range across the rows. The shifts (L,
+    N, 2) include the whole-frame offset, and (L, N) bool states which peaks are inside the range.
     """
-    factor = next((factor for factor in (BINNING, BINNING // 2) if task.width // factor >= 64), 1)
-    reach, width, height = -(-task.search // factor), task.width // factor, task.first.shape[-2]
-
-    def binned(image: Tensor, left: Tensor, columns: int) -> Tensor:
-        whole = take_windows(image, torch.zeros_like(left), left, height, columns * factor)[:, 0]
-        return whole.unflatten(-1, (columns, factor)).mean(-1)
-
-    first = binned(task.first, task.left[:, None], width)
-    left = (task.left + task.coarse[:, 0])[:, None] - reach * factor
-    second = binned(task.second, left, width + 2 * reach)
-    rows = task.places[..., 1]
-    of_first = torch.stack([torch.zeros_like(rows), rows], -1)
-    of_second = torch.stack([torch.full_like(rows, reach), rows + task.coarse[:, None, 1]], -1)
-    surface = _correlate_bands(first, second, of_first, of_second, (task.height, width), (task.search, reach))
-    lag, inside = whole_pixel_peak(surface, factor)
-    return task.start + lag, inside
+    places, reach = task.places, task.search
+    surface = _correlate_bands(
+        task.first, task.second, places, places + task.start, (task.height, task.width), (reach, reach)
+    )
+    flat, shape = surface.flatten(0, 1), surface.shape[:2]
+    place, value = integer_peak(flat)
+    inside = (~_at_edge(place, flat) & (value > 0)).unflatten(0, shape)
+    return surface, task.start + (place.flip(-1) - reach).unflatten(0, shape), inside
 
 
 # Zero-mean normalised cross-correlation (NCC)
@@ -191,11 +167,14 @@ def _whole_pixels(task: BandTask) -> tuple[Tensor, Tensor]:
 
 def register_ncc(task: BandTask) -> tuple[Tensor, Tensor]:
     """Offsets and quality of bands by the peak of their cross-correlation."""
-    shift, inside = _whole_pixels(task)
-    places, moved = task.places, task.places + shift
-    surface = _correlate_bands(task.first, task.second, places, moved, (task.height, task.width), (LAGS, LAGS))
-    inside &= (moved[..., 1] >= LAGS) & (moved[..., 1] + task.height + LAGS <= task.first.shape[-2])
-    return fine_offsets(task, shift, surface, inside)
+    surface, shift, inside = _search(task)
+    return fine_offsets(task, task.start, surface, inside & _inside(task, shift))
+
+
+def _inside(task: BandTask, shift: Tensor) -> Tensor:
+    """(L, N) bool: whether the later frame contains all lags around whole-pixel shifts (L, N, 2)."""
+    top = task.tops + shift[..., 1]
+    return (top >= LAGS) & (top + task.height + LAGS <= task.first.shape[-2])
 
 
 def _correlate_bands(
@@ -283,7 +262,7 @@ def register_phase(task: BandTask) -> tuple[Tensor, Tensor]:
     determine its peak.
     """
     places, num_rows = task.places, task.first.shape[-2]
-    shift, valid = _whole_pixels(task)
+    _, shift, valid = _search(task)
     fraction = torch.zeros_like(shift, dtype=task.first.dtype)
     template = take_windows(task.first, places[..., 1], places[..., 0], task.height, task.width)
     for _ in range(2):  # the window follows the content: to a whole pixel, then to a fraction
@@ -339,11 +318,11 @@ def register_projection(task: BandTask) -> tuple[Tensor, Tensor]:
 
     The sum of the correlations along both axes has its peak where each of them has its own.
     """
-    shift, valid = _whole_pixels(task)
+    _, shift, valid = _search(task)
     down, along = (_profile_correlation(task, shift, reach) for reach in ((LAGS, 0), (0, LAGS)))
-    top = task.places[..., 1] + shift[..., 1]
-    valid &= (top >= LAGS) & (top + task.height + LAGS <= task.first.shape[-2])
-    valid &= torch.minimum(down.amax(-1), along.amax(-1)) > 0.6  # profiles of a few dozen rows reach 0.6 by chance
+    valid &= _inside(task, shift) & (
+        torch.minimum(down.amax(-1), along.amax(-1)) > 0.6
+    )  # profiles of a few dozen rows reach 0.6 by chance
     return fine_offsets(task, shift, 0.5 * (down[..., :, None] + along[..., None, :]), valid)
 
 

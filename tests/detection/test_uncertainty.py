@@ -18,8 +18,8 @@ from rsvib_torch import (
 from rsvib_torch.datasets import city_and_fields, example_frames
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.sensitivity import assumptions, timing_sensitivity
-from rsvib_torch.detection.tones.fit import displacement_std, fit_tones, vibration_of_fit, with_errors_of_blocks
-from rsvib_torch.detection.tones.uncertainty import with_further_tones, with_weak_aliasing, without_aliasing
+from rsvib_torch.detection.tones.fit import displacement_std, fit_tones, vibration_of_fit
+from rsvib_torch.detection.tones.uncertainty import with_further_tones, without_aliasing
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")  # exact displacements along y: 0 / 0 is no error
@@ -121,49 +121,6 @@ def test_bias_by_aliasing_is_removed_and_allowed_for(num_frames):
     assert 0.4 < rms(in_std[1]) < 1.3  # the bias increases the variance of the residuals
     # a displacement of 0.1 px shows its part of the bias as an amplitude; the prior allows for 3e-3 px
     assert 0.5 < rms(in_std[0]) < 2.5
-
-
-@pytest.mark.parametrize(("num_frames", "size", "most"), [(4, 0.02, 0.75), (8, 0.02, 0.55), (8, 0.0, 1.02)])
-def test_aliasing_of_single_rows_is_weakened(num_frames, size, most):
-    """Every row has c cos(2 pi d) + s sin(2 pi d) of its own; noise alone leaves the fit as it is."""
-    generator, batch = np.random.default_rng(num_frames), 200
-    frequency, starts = np.full(batch, 37.0), starts_of(TIMING, num_frames)
-    true = mean_sine(np.full(batch, 1.7), frequency, generator.uniform(-3, 3, batch), starts, TIMING.exposure_time)
-    c, s = size * generator.standard_normal((2, batch, ROWS, 1))
-    biased = true + c * np.cos(2 * np.pi * true) + s * np.sin(2 * np.pi * true)
-    measurements = measured(biased, TIMING, generator)
-    raw = fitted(measurements, frequency)
-    weak = with_weak_aliasing(measurements, raw)
-    found = fit_tones(weak, raw, raw.active)
-
-    errors = [vibration_of_fit(fit)[0].amplitude[:, 0, 0] - 1.7 for fit in (raw, found)]
-    assert rms(errors[1]) < most * rms(errors[0])
-    std = vibration_of_fit(with_errors_of_blocks(weak, found))[1].amplitude[:, 0, 0]
-    assert 0.8 < rms(errors[1] / std) < 1.2
-
-
-def test_two_frames_do_not_tell_aliasing_of_single_rows_from_motion():
-    truth = mean_sine([2.0], [37.0], [0.4], starts_of(TIMING, 2), TIMING.exposure_time)
-    measurements = measured(truth, TIMING)
-    fit = fitted(measurements, [37.0])
-    assert with_weak_aliasing(measurements, fit) is measurements
-
-
-def test_errors_that_a_part_of_the_scene_has_in_all_frames_are_contained():
-    """Every row moves by another share of the motion: more frames do not average that out."""
-    generator, batch = np.random.default_rng(9), 200
-    frequency, starts = np.full(batch, 37.0), starts_of(TIMING, 6)
-    true = mean_sine(np.ones(batch), frequency, np.full(batch, 0.4), starts, TIMING.exposure_time)
-    wrong = true * (1 + 0.02 * generator.standard_normal((batch, ROWS, 1)))
-    measurements = measured(wrong, TIMING, generator, noise=1e-3)
-    raw = fitted(measurements, frequency)
-
-    def rms_in_std(fit):
-        vibration, std = vibration_of_fit(fit)
-        return rms((vibration.amplitude[:, 0, 0] - 1.0) / std.amplitude[:, 0, 0])
-
-    assert rms_in_std(raw) > 1.7
-    assert 0.8 < rms_in_std(with_errors_of_blocks(measurements, raw)) < 1.2
 
 
 def test_exact_displacements_have_finite_standard_deviations():

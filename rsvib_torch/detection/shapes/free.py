@@ -261,7 +261,7 @@ def start_of_stack(stack: GreyFrames, timing: SensorTiming, bands: RegistrationO
     """
     rowwise = timing.in_row_order()
     rowwise.check_rows(stack.images.shape[-2])
-    start = band_start(stack, rowwise, bands, None, mere_start=True)
+    start = band_start(stack, rowwise, bands, mere_start=True)
     share = float(start.curve.good.double().mean())
     if share < 0.25:
         raise ValueError(

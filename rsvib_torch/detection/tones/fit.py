@@ -198,11 +198,16 @@ class _Problem:
         return self.measurements.num_measurements - split_axis(self.free, 1, self.axes, -1).sum(-1)
 
     def variances(self, state: _Estimate) -> Array:
-        """(B, 2) variance of the errors of each axis, in units of those of the measurements, from the residual."""
-        spare = np.maximum(self.num_spare, 1.0)
+        """(B, 2) variance of the errors of each axis, in units of those of the measurements, from the residual.
+
+        A fit with no more independent measurements than parameters is exact for any errors, which then count as large
+        as the displacements.
+        """
+        measurements, spare = self.measurements, np.maximum(self.num_spare, 1.0)
         if self.axes > 2:  # unequal variances would not keep the precise combinations of correlated components
             return np.broadcast_to((state.cost / spare.sum(-1))[:, None], spare.shape)
-        return self.measurements.square(state.residual) / spare
+        largest = measurements.square(measurements.displacements) / np.maximum(measurements.num_measurements, 1.0)
+        return np.where(self.num_spare > 0, measurements.square(state.residual) / spare, largest)
 
     def covariance(self, state: _Estimate, deviation: Array) -> Array:
         """Covariance (B, 2 P, 2 P) for errors of a row of the covariance ``S W^-1 S``, S the deviations (B, 2)."""
@@ -218,25 +223,6 @@ class _Problem:
         """Inverse (B, M, M) of the normal matrix of the free parameters; 0 for the others."""
         matrix, scale = _scaled(state, self.free, np.zeros_like(state.cost))
         return np.linalg.inv(matrix) * scale[:, :, None] * scale[:, None]
-
-    def covariance_of_blocks(self, state: _Estimate) -> Array:
-        """Covariance (B, A P, A P) from the scatter of the residuals between blocks of the scene.
-
-        Errors of a block may be alike in all frames: with the sums ``u_n`` of its whitened derivatives times residuals
-        over these, it is ``H^-1 sum u_n u_n^T H^-1`` (Liang and Zeger, Biometrika 73, 13, 1986).
-        """
-        inverse = self.inverse(state)
-        columns, whitened = self.in_std(state.jacobian, state.residual)
-        groups = self.measurements.groups
-        count = state.residual.shape[1] // groups
-        sums = (columns * whitened).reshape(len(columns), groups, count, -1, columns.shape[-1]).sum((1, 3))
-        meat = sums.mT @ sums
-        for lag in (1, 2):  # neighbours, with the weights of Newey and West
-            product = sums[:, lag:].mT @ sums[:, :-lag]
-            meat = meat + (1 - lag / 3) * (product + product.mT)
-        used = (np.abs(sums).max(-1) > 0).sum(-1)
-        spent = self.free.sum(-1) / self.axes
-        return inverse @ meat @ inverse * (used / np.maximum(used - spent, 1.0))[:, None, None]
 
     @staticmethod
     def _whitened(root: Array, jacobian: Array) -> Array:
@@ -366,45 +352,6 @@ def fitted_again(measurements: Measurements, fit: ToneFit) -> ToneFit:
     """``fit_tones`` from an earlier fit, and that fit itself for stacks where it diverges."""
     exact = fit_tones(measurements, fit, fit.active)
     return select_stacks(is_bounded(exact, measurements.exposure_time), exact, fit)
-
-
-def with_errors_of_blocks(measurements: Measurements, fit: ToneFit) -> ToneFit:
-    """The fit with standard deviations that are at least those by the scatter of blocks of the scene.
-
-    Aliasing and fixed patterns depend on the scene, so that more frames do not average them out: in eight frames with
-    little text, the amplitude was wrong by 6 standard deviations without this step, and by 3 with it.
-    """
-    problem = _Problem(measurements, fit.active, fit.drift_order)
-    fit = fit.about(measurements.centre)
-    of_blocks = problem.covariance_of_blocks(problem.evaluate(fit.parameters))
-    # along the amplitude and the phase of each tone
-    turn = np.broadcast_to(np.eye(of_blocks.shape[-1]), of_blocks.shape).copy()
-    size = turn.shape[-1] // fit.active.shape[1]
-    phase = np.angle(fit.coefficients)
-    for axis, tone in np.ndindex(*fit.active.shape[1:]):
-        re = axis * size + 3 * tone
-        cos, sin = np.cos(phase[:, axis, tone]), np.sin(phase[:, axis, tone])
-        turn[:, re, re], turn[:, re, re + 1], turn[:, re + 1, re], turn[:, re + 1, re + 1] = cos, sin, -sin, cos
-    stated, scatter = (turn @ values @ turn.mT for values in (fit.covariance, of_blocks))
-    ratio = scatter.diagonal(axis1=-2, axis2=-1) / np.maximum(stated.diagonal(axis1=-2, axis2=-1), 1e-300)
-    factor = np.sqrt(np.clip(without_nan(ratio, 1.0), 1.0, 1e4))
-    return replace(fit, covariance=turn.mT @ (stated * factor[:, :, None] * factor[:, None]) @ turn)
-
-
-def with_unknown_errors(measurements: Measurements, fit: ToneFit) -> ToneFit:
-    """The fit with errors as large as the displacements on axes with no more independent measurements than parameters.
-
-    Such a fit is exact for any errors, and its residual contains nothing of them.
-    """
-    problem = _Problem(measurements, fit.active, fit.drift_order)
-    unknown = problem.num_spare <= 0.0
-    if not bool(unknown.any()):
-        return fit
-    fit = fit.about(measurements.centre)
-    state = problem.evaluate(fit.parameters)
-    largest = measurements.square(measurements.displacements) / np.maximum(measurements.num_measurements, 1.0)
-    variances = np.where(unknown, largest, problem.variances(state))
-    return replace(fit, covariance=problem.covariance(state, np.sqrt(variances)))
 
 
 # px, motion during an exposure; px and px/s, amplitude and drift; Hz. Fits beyond diverge: frames are smaller

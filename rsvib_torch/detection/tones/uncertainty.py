@@ -1,4 +1,4 @@
-"""Uncertainty of a fit that its residual does not contain: aliasing, slow errors, further tones.
+"""Uncertainty of a fit that its residual does not contain: aliasing, further tones.
 
 Each effect of response Z and size v changes the parameters of the fit by ``-X^+ Z v`` to first order, X being the
 whitened Jacobian of the free parameters. An uncertainty C of v therefore adds ``X^+ Z C (X^+ Z)^T`` to their covariance
@@ -12,9 +12,7 @@ frequency. Products of this part with itself and with the scene bias the displac
 less its mean over the G frames, with the mean m of ``exp(2 pi i d_q)`` over the frames q. Along rows, b is negative and
 has about the size that follows from the spectrum of the frames: 2e-3 px for optics of 0.4 px (Gaussian, standard
 deviation). c and s are small, unless many edges have the same place within a pixel. The phase of the bias turns with
-every pixel of displacement, so that motions of more than about 1 px determine all three from the residuals. Each block
-of rows also has c and s that differ from those of other blocks. In three or more frames, the residuals along
-``cos 2 pi d`` and ``sin 2 pi d`` therefore have less weight (``with_weak_aliasing``).
+every pixel of displacement, so that motions of more than about 1 px determine all three from the residuals.
 
 *Further tones.* A record of few frames often agrees with several numbers of tones. The covariance of a fit holds for
 its number only. It is extended by the mean over models with a further tone of any frequency, each weighted with its
@@ -40,7 +38,6 @@ from rsvib_torch.detection.tones.fit import (
     displacement_std,
     displacements,
     free_jacobian,
-    model_displacements,
     offset_gain,
     residual_of,
     tone_response,
@@ -48,7 +45,7 @@ from rsvib_torch.detection.tones.fit import (
 )
 from rsvib_torch.execution.parallel import runs
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
-from rsvib_torch.numerics.tables import Array, pseudo_inverse, split_axis, tensor, unit_wave, valid_mean, without_nan
+from rsvib_torch.numerics.tables import Array, pseudo_inverse, split_axis, tensor, unit_wave, without_nan
 
 # Mean, and standard deviations of b, c and s, of x and of y over the expected size of b; chosen with 220 recordings of
 # drawn and real scenes. In 60 others each behind optics of 0.4 and 0.55 px, with one tone in 2 to 8 frames, the rms
@@ -79,11 +76,6 @@ _UNEXPLAINED_IN_COMMON = 0.25
 # standard deviation of the quadratures of the further tone over the norm of the amplitudes; 95 to 96 % of the 95 %
 # intervals of 150 simulated recordings with random tones contain the truth, with 0.2 fewer
 _PRIOR_SIZE = 0.5
-# Standard deviation of the quadratures of slow errors over the rms offset. An error of a few thousandths of a pixel
-# changes the amplitude of a tone of less than a period by a tenth: of 46 axes with 0.58 periods, one had 5.6 standard
-# deviations without this term, and 3.7 with it. The intervals of faster tones contain the truth without it.
-_SLOW_ERROR, _MAX_SLOW_ERROR = 5e-4, 2e-3  # -, px
-_SLOW = 2.0  # periods in the record
 _POINTS = 4  # frequencies per 1 / duration of the record
 _REACH = 8  # distance of the frequencies from those of the tones, and from 0, times the duration
 _CHUNK = 2**22  # values at a time
@@ -187,42 +179,6 @@ def without_aliasing(measurements: Measurements, fit: ToneFit, size: Array) -> T
     )
 
 
-def with_weak_aliasing(measurements: Measurements, fit: ToneFit) -> Measurements:
-    """The measurements in which aliasing of single blocks of rows is weakened to their noise.
-
-    The ratio of c and s to the noise of a block is random, of a variance that all blocks of an axis have in common, the
-    one of the largest likelihood. In two frames, the difference of a block contains both, and the columns of a roll
-    have other phases: such measurements are not changed.
-
-    Rms errors over the bound of 190 axes in eight frames of a camera that aliases, without and with it: amplitude 10.5,
-    6.5; frequency 7.5, 4.0; standard deviations over the bound 3.6, 2.5. Of 234 axes in four frames: 8.9, 9.0; 5.2,
-    4.3; 4.9, 3.5.
-    """
-    if fit.drift.shape[1] > 2 or measurements.visible.shape[2] == 2:
-        return measurements
-    # 1. Orthogonal directions of the errors of each block over the frames, their power, and the residuals along them.
-    turn = unit_wave(2 * math.pi * displacements(measurements, fit))
-    waves = measurements.relative(np.stack([turn.real, turn.imag], -1))  # (B, N, G, A, 2)
-    directions, sizes, _ = np.linalg.svd(np.moveaxis(waves, 2, 3), full_matrices=False)  # (B, N, A, G, 2), (B, N, A, 2)
-    residual, weight = residual_of(measurements, fit), measurements.inverse_variances
-    along = np.einsum("bnagq,bnga->bnaq", directions, residual)
-    squares = weight[..., None] * np.square(along)
-    power = np.square(sizes) * (weight > 0)[..., None]
-    # 2. The variance of the errors over that of the noise, for each axis.
-    whole, count = measurements.square(residual), ((weight > 0) * measurements.num_differences[..., None]).sum(1)
-    ratios = np.array([0.0, *np.logspace(-2, 4, 25)])[:, None, None]
-    likelihoods = []
-    for ratio in ratios:
-        errors = ratio[..., None, None] * power
-        left = np.maximum(whole - (squares * errors / (1 + errors)).sum((1, 3)), 1e-12 * whole + 1e-300)
-        likelihoods.append(-0.5 * count * np.log(left) - 0.5 * np.log1p(errors).sum((1, 3)))
-    errors = ratios[np.argmax(likelihoods, 0), 0, 0][:, None, :, None] * power
-    # 3. Whitening of the residuals.
-    vectors = directions * np.sqrt(1 - 1 / np.sqrt(1 + errors))[..., None, :]
-    weakened = replace(measurements, weakened=np.moveaxis(vectors, 3, 2))
-    return replace(weakened, displacements=weakened.relative(measurements.displacements))
-
-
 # --- Errors of the amplitudes ---
 
 
@@ -288,7 +244,7 @@ def _path_within(fit: ToneFit, exposure_time: float) -> Array:
     return np.asarray(fit.amplitude * np.minimum(2 * math.pi * fit.frequencies * exposure_time, 2.0))
 
 
-# --- Further tones and slow errors ---
+# --- Further tones ---
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,21 +265,18 @@ class StatedFit:
 def with_further_tones(
     measurements: Measurements, fit: ToneFit, exposure_starts: Array, *, number_is_known: bool = False
 ) -> tuple[StatedFit, StatedFit]:
-    """The fit with slow errors in its covariance, and with an allowance for a further tone; rows start at (N,) s."""
+    """The fit as it is, and with an allowance for a further tone in its covariance; rows start at (N,) s."""
     rows = np.broadcast_to(exposure_starts, (len(fit.centre), len(exposure_starts)))
-    variance = np.square(displacement_std(fit, exposure_starts, measurements.exposure_time))
-    stated = [(fit.covariance.copy(), variance.copy()) for _ in range(2)]
+    known = StatedFit(fit, displacement_std(fit, exposure_starts, measurements.exposure_time))
+    if number_is_known:
+        return known, known
+    covariance, variance = fit.covariance.copy(), np.square(known.displacement_std)
     jacobian = displacement_jacobian(fit, rows, measurements.exposure_time)
-    slow_errors = _slow_errors(measurements, fit)
     for axis, problem in linearised(measurements, fit):
-        of_axis = _added(measurements, fit, axis, problem, rows, jacobian, slow_errors[:, axis], number_is_known)
-        for (covariance, variance), (added, moved) in zip(stated, of_axis, strict=True):
-            problem.add_covariance(covariance, added)
-            variance[:, problem.axes] += moved
-    known, hidden = (
-        StatedFit(replace(fit, covariance=covariance), np.sqrt(variance)) for covariance, variance in stated
-    )
-    return known, hidden
+        added, moved = _added(measurements, fit, axis, problem, rows, jacobian)
+        problem.add_covariance(covariance, added)
+        variance[:, problem.axes] += moved
+    return known, StatedFit(replace(fit, covariance=covariance), np.sqrt(variance))
 
 
 def _grid(measurements: Measurements, fit: ToneFit, axis: int) -> tuple[Array, Array]:
@@ -347,17 +300,15 @@ def _added(
     problem: LinearisedFit,
     rows: Array,
     jacobian: Array,
-    slow_error: Array,
-    number_is_known: bool,
-) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Covariance (B, A P, A P) of the parameters and variance (B, A) of the displacement, by tones of an axis.
+) -> tuple[Array, Array]:
+    """Covariance (B, A P, A P) of the parameters and variance (B, A) of the displacement, by a further tone of an axis.
 
-    By slow errors only, of (B,) px, and with a further tone. ``rows`` (B, n) are exposure starts in s, ``jacobian`` (B,
-    n, A', P) the derivatives of their displacements by the parameters of each axis.
+    ``rows`` (B, n) are exposure starts in s, ``jacobian`` (B, n, A', P) the derivatives of their displacements by the
+    parameters of each axis.
     """
     axes = problem.axes
     of_displacement = _without_trend(jacobian[:, :, axes], rows)
-    of_tone = np.eye(len(axes))[axes.index(axis)][:, None, None]
+    of_axis = np.eye(len(axes))[axes.index(axis)][:, None, None]
     # 1. Prior of the quadratures: their precision, and the least precision that rounding leaves.
     size = _PRIOR_SIZE * np.sqrt(np.square(fit.amplitude[:, axis]).sum(-1))  # (B,) px
     precision = (1 / np.square(np.where(size > 0, size, 1.0)))[:, None, None, None]
@@ -383,7 +334,7 @@ def _added(
         attenuation = np.sinc(chunk * measurements.exposure_time)[:, None]
         S = _without_trend(_quadratures(attenuation * waves), rows)
         changes = split_axis(back, 1, len(axes), -1)  # (B, A, P, F, 2)
-        S = S[:, :, None] * of_tone - np.einsum("bnam,bamfq->bnafq", of_displacement, changes, optimize=True)
+        S = S[:, :, None] * of_axis - np.einsum("bnam,bamfq->bnafq", of_displacement, changes, optimize=True)
         moved = np.einsum("bnafp,bnafq->bfapq", S, S) / S.shape[1]
         parts.append((evidence, C + v[..., :, None] * v[..., None, :], np.moveaxis(back, 1, 2), moved))
     evidence, second, back, moved = (np.concatenate(values, 1) for values in zip(*parts, strict=True))
@@ -391,25 +342,9 @@ def _added(
     counted = counted & (size > 0)[:, None]
     prior = np.where(counted, -np.log(np.maximum(counted.sum(1, keepdims=True), 1.0)), -math.inf)
     probability = special.softmax(np.pad(evidence + prior, ((0, 0), (1, 0))), -1)[:, 1:]
-    if number_is_known:
-        probability = np.zeros_like(probability)
-    # 5. Mean over all frequencies, and slow errors with equal variances at the low frequencies.
-    slow = frequencies * measurements.span[:, None] <= _SLOW
-    slow_variance = slow * (np.square(slow_error) / np.maximum(slow.sum(1), 1))[:, None]
-    of_slow_errors = slow_variance[..., None, None] * eye
-    with_tone = probability[..., None, None] * second + of_slow_errors
-    known, hidden = (
-        ((back @ part @ back.mT).sum(1), (moved * part[:, :, None]).sum((1, 3, 4)))
-        for part in (of_slow_errors, with_tone)
-    )
-    return known, hidden
-
-
-def _slow_errors(measurements: Measurements, fit: ToneFit) -> Array:
-    """(B, A) px, standard deviation of errors that all rows of an axis have in common; 0 without a slow tone."""
-    slow = (fit.active & (fit.frequencies * measurements.span[:, None, None] <= _SLOW)).any(-1)
-    offset = math.sqrt(2) * measurements.distances(model_displacements(measurements, fit))
-    return slow * np.minimum(_SLOW_ERROR * np.sqrt(without_nan(valid_mean(np.square(offset), 1), 0.0)), _MAX_SLOW_ERROR)
+    # 5. Mean over all frequencies.
+    of_tone = probability[..., None, None] * second
+    return (back @ of_tone @ back.mT).sum(1), (moved * of_tone[:, :, None]).sum((1, 3, 4))
 
 
 def _quadratures(response: Array) -> Array:
