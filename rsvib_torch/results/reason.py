@@ -156,9 +156,7 @@ _MORE_FRAMES = "use more frames"
 _MAY_BE_STILL = "the camera may stand still along this axis; use more frames if a vibration is expected"
 _CHANGES = "detect_motion if the vibration changes"
 _TONES_OR_FREE = f"try more tones, or {_CHANGES}"
-_CHECK_TIMING = (
-    "and check frame_rows, row_time, exposure_rows and the start times of the frames (lost or repeated ones?)"
-)
+_CHECK_TIMING = "and check frame_rows, row_time, exposure_rows and the times of frames (lost or repeated ones?)"
 _UNCERTAIN = "the displacement of the rows is uncertain: {size:.2g} ± {value:.2g} px"
 
 _px = partial(ReasonKind, unit="px")
