@@ -207,13 +207,14 @@ class Measurements:
         return np.sqrt(np.where(total > 1.645 * deviation, total / np.maximum(weight.sum(1), 1e-300), 0.0))
 
     def of_worst_group(self, residual: Array) -> Array:
-        """(B, 2) px, residual of the typical row of the group of frames that is explained worst.
+        """(B, 1) px, residual of the typical row of the group of frames that is explained worst, of any axis.
 
-        0 unless it is more than ``_WORST`` times that of the typical group. Clouds may cover half of the rows.
+        0 unless it is more than ``_WORST`` times that of the typical group. Clouds may cover half of the rows. All
+        axes have it: the displacement along one determines which rows are compared along the others.
         """
         of_groups = median(split_axis(self.distances(residual), 1, self.groups, -1), 2)
         worst = without_nan(of_groups, 0.0).max(1)
-        return np.where(worst > _WORST * median(of_groups, 1), worst, 0.0)
+        return np.where(worst > _WORST * median(of_groups, 1), worst, 0.0).max(-1, keepdims=True)
 
     def independent_fraction(self, residual: Array) -> Array:
         """(B,) fraction of the rows that are independent, from the correlation rho(k) of residuals k rows apart.
