@@ -103,8 +103,7 @@ class Attempt:
     @property
     def visible(self) -> Array:
         """(B,) bool, stacks of which rows or bands were measured."""
-        refined = self.fitted.refined
-        return np.ones_like(self.fit.centre, dtype=bool) if refined is None else refined.other_motion.measured > 0
+        return np.any(self.fitted.measurements.weights > 0, (1, 2))
 
 
 def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hypothesis: Hypothesis) -> Attempt:

@@ -156,7 +156,7 @@ _MORE_FRAMES = "use more frames"
 _MAY_BE_STILL = "the camera may stand still along this axis; use more frames if a vibration is expected"
 _CHANGES = "detect_motion if the vibration changes"
 _TONES_OR_FREE = f"try more tones, or {_CHANGES}"
-_CHECK_TIMING = "and check frame_rows, row_time, exposure_rows and the start times of the frames"
+_CHECK_TIMING = "and check frame_rows, row_time, exposure_rows and the times of frames (lost or repeated ones?)"
 _UNCERTAIN = "the displacement of the rows is uncertain: {size:.2g} ± {value:.2g} px"
 
 _px = partial(ReasonKind, unit="px")
@@ -169,8 +169,8 @@ _TONES = {
         "only {value:.0%} of {what} can be registered, {limit:.0%} are needed: the motion is beyond the search range, "
         "or the frames lack detail or show different scenes",
         "increase search",
-        "fraction of the visible rows or bands that were registered and of the registered bands that correlate more "
-        "than independent noise, below 0.5",
+        "fraction of the visible rows (of the frames with the fewest) or bands that were registered and of the "
+        "registered bands that correlate more than independent noise, below 0.5",
     ),
     "no_tone": ReasonKind(
         "no significant tone: the offsets are those of a uniform motion, or below their noise", _MAY_BE_STILL
@@ -237,8 +237,8 @@ _TONES = {
     "rows_unexplained": _px(
         "rows move by {value:.3g} px that no tone explains, {limit:.2g} px are allowed",
         f"{_TONES_OR_FREE}, {_CHECK_TIMING}",
-        "rms residual of the rows without their noise, of all frames or of one group, above 0.6 % of the rms offsets, "
-        "at least 0.05 px and at most 0.1 px",
+        "rms residual of the rows without their noise, or residual of the typical row of the frames that are explained "
+        "worst if it is 5 times that of all, above 0.6 % of the rms offsets, at least 0.05 px and at most 0.1 px",
         free_model=True,
     ),
     "neighbours_unexplained": _px(

@@ -112,6 +112,23 @@ def test_a_batch_names_the_cause_of_its_own_stack(frames):
     assert [cause.code for cause in causes(found[1])] == ["other_readout_direction"]
 
 
+@pytest.mark.parametrize(
+    "taken", [(0, *range(2, 9)), (*range(7), 6), (*range(6), 7, 6)], ids=["lost", "stale", "swapped"]
+)
+def test_frames_at_other_times_than_stated_are_refused(taken):
+    """Each is one of eight frames, whose rows were left out: an axis was reliable, and a frame wrong by 1 px."""
+    timing = SensorTiming(row_time=1 / (RATE * 500), exposure_rows=100, frame_rows=500)
+    motion = Motion((2.8, 2.2), (13.0, 17.0), (0.4, 1.3), (30.0, 20.0))
+    later = np.subtract(taken, range(8)) / RATE
+
+    @Curve
+    def moved(times):
+        return motion.displacement(times + later[(times * RATE + 1e-6).astype(int).clip(0, 7)])
+
+    found = detect_vibration(recorded((160, 128), timing, moved, 8, 0.004, seed=8), timing)
+    assert ["rows_unexplained" in [one.code for one in of_axis] for of_axis in found.findings] == [True, True]
+
+
 def test_an_axis_beside_one_that_is_contradicted_has_an_assumption():
     """With a wrong readout direction, two axes of 28 were reliable, and wrong, beside a contradicted one."""
 
