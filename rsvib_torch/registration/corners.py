@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rsvib_torch.motion.camera import displacement_factors
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array, table, tensor
+from rsvib_torch.registration.patch_blur import blur_products, smoothed
 
 Grey = NDArray[np.uint8]
 Points = NDArray[np.float64]  # (N, 2) px, (x, y) from the middle of the first pixel
@@ -62,6 +63,7 @@ class Corners:
     places: Array  # (N, 2) px from the centre of the frame, (x, y), mean of both frames
     offsets: Array  # (N, 2) px
     layer: NDArray[np.bool_]  # (N,) whether they move with the part of the scene that most corners have moved with
+    blur: Array  # (N, 4, 4), see ``blur_products``
 
     @property
     def factors(self) -> Array:
@@ -73,7 +75,7 @@ class Corners:
     def joined(parts: Sequence["Corners"]) -> "Corners":
         """The corners of all pairs."""
         pairs = np.concatenate([np.full(len(part.rows), number) for number, part in enumerate(parts)])
-        rest = ([getattr(part, name) for part in parts] for name in ("rows", "times", "places", "offsets", "layer"))
+        rest = ([getattr(part, name) for part in parts] for name in ("rows", "times", "places", "offsets", "layer", "blur"))
         return Corners(pairs, *(np.concatenate(values) for values in rest))
 
 
@@ -91,7 +93,8 @@ class CornerFollower:
     def __init__(self, timing: SensorTiming, *, most: int = 256, consistent: bool = True) -> None:
         self._timing, self._most, self._consistent = timing, most, consistent
         self._start = 0.0  # s, of the frame before
-        self._before: tuple[Grey, Grey | None] | None = None  # the frame before, of reduced size, and its mask
+        # the frame before, of reduced size, and its mask, and how its blur is compared
+        self._before: tuple[Grey, Grey | None, NDArray[np.float32]] | None = None
         self._known, self._votes = _NO_CORNERS  # corners in it, and the votes of each of them, see ``_in_layer``
 
     def next(self, grey: Grey, start: float, mask: Grey | None = None) -> Corners | None:
@@ -109,7 +112,7 @@ class CornerFollower:
             around = cv2.blur(second, (_AROUND, _AROUND))
             second = np.asarray(cv2.addWeighted(second, 1.0, around, -1.0, 128.0), np.uint8)
         starts = np.array([self._start, start])
-        self._before, self._start = (second, mask), start
+        self._before, self._start = (second, mask, smoothed(second)), start
         self._known, self._votes = _NO_CORNERS
         if before is None:
             return None
@@ -134,13 +137,14 @@ class CornerFollower:
             found, ends, votes = found[agree], ends[agree], votes[agree]
             layer = _in_layer(found, ends, votes, scale)
             self._known, self._votes = ends, np.where(layer, votes + 1, np.minimum(votes, 0) - 1)
+        blur = blur_products(before[2], self._before[2], found, ends)
         found, ends = ((points + 0.5) * scale - 0.5 for points in (found, ends))
         # 3. The times of their rows.
         rows = np.stack([found[:, axis], ends[:, axis]], -1)
         rows = rows if timing.readout_direction == "forward" else count - 1 - rows
         times = starts + rows * timing.row_time + 0.5 * timing.exposure_time
         places = 0.5 * (found + ends) - 0.5 * (np.array([width, height]) - 1)
-        return Corners(np.zeros(len(found), np.int64), rows[:, 0] / count, times, places, ends - found, layer)
+        return Corners(np.zeros(len(found), np.int64), rows[:, 0] / count, times, places, ends - found, layer, blur)
 
 
 def _agreeing(found: Points, ends: Points, axis: int, length: int, scale: int) -> NDArray[np.bool_]:

@@ -187,6 +187,7 @@ class WindowPath:
     other_readout: tuple[str, float, float] | None
     # part of the stated time of the readout, by which the path and the tones displace the rows; 0: as columns do
     part: float
+    blur: tuple[float, float]  # ``window_blur.blur_ratio``; NaN without tones
     agreeing: tuple[str, ...]  # other readouts that explain the corners as well, and the frequencies of their tones
 
     def path(self, times: Array, derivative: int = 0) -> Array:
@@ -475,6 +476,7 @@ class WindowFit:
         other_readout: tuple[str, float, float] | None = None,
         *,
         part: float = 1.0,
+        blur: tuple[float, float] = (math.nan, math.nan),
         agreeing: tuple[str, ...] = (),
     ) -> WindowPath:
         """The result of the fit; the arguments are those of ``WindowPath``."""
@@ -483,7 +485,7 @@ class WindowFit:
         if not self.layer.all():  # with a subject on 40 % of the frame, tones of 0.1 px were found that are none
             residual_of_most = float(np.quantile(self.distance, 0.8)) / _FOUR_FIFTHS
         of_window, of_fit = (self.origin, self.start, self.step, knots, tuple(self.tones)), (residual, residual_of_most)
-        return WindowPath(*of_window, *of_fit, other_readout, part, agreeing)
+        return WindowPath(*of_window, *of_fit, other_readout, part, blur, agreeing)
 
     def is_apart_from(self, frequency: float, others: Array) -> NDArray[np.bool_]:
         """Whether other frequencies are not those of a tone, nor of a change of its amplitude."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from rsvib_torch.detection.sensitivity import timing_sensitivity, with_row_time_std
 from rsvib_torch.detection.tones.fit import ToneFit
+from rsvib_torch.detection.verdict import exposure_reasons
 from rsvib_torch.execution.parallel import ONE_BLAS_THREAD, prefetched
 from rsvib_torch.gyroscope.corner_tracks import followed_pair, tracks_of_pairs
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
@@ -316,6 +317,7 @@ class VideoPasses:
             )
             if value > allowed
         ]
+        against += exposure_reasons(self.frames.job.timing.in_row_order(), *window.blur)
         if window.other_readout is not None:
             name, stated, other = window.other_readout
             against.append(Reason("readout_contradicted", None, stated, other, {"other": name}))
