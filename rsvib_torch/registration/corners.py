@@ -75,7 +75,9 @@ class Corners:
     def joined(parts: Sequence["Corners"]) -> "Corners":
         """The corners of all pairs."""
         pairs = np.concatenate([np.full(len(part.rows), number) for number, part in enumerate(parts)])
-        rest = ([getattr(part, name) for part in parts] for name in ("rows", "times", "places", "offsets", "layer", "blur"))
+        rest = (
+            [getattr(part, name) for part in parts] for name in ("rows", "times", "places", "offsets", "layer", "blur")
+        )
         return Corners(pairs, *(np.concatenate(values) for values in rest))
 
 

@@ -29,8 +29,9 @@ def blur_products(first: NDArray[np.float32], second: NDArray[np.float32], found
     def patches(frame: NDArray[np.float32], centres: Array) -> NDArray[np.float32]:
         x, y = centres.T.astype(np.float32)[..., None, None]
         shape = len(centres), len(steps), len(steps)
-        at = [np.broadcast_to(place, shape).reshape(-1, len(steps)) for place in (x + steps, y + steps[:, None])]
-        return np.asarray(cv2.remap(frame, *at, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101)).reshape(shape)
+        at_x, at_y = (np.broadcast_to(at, shape).reshape(-1, len(steps)) for at in (x + steps, y + steps[:, None]))
+        values = cv2.remap(frame, at_x, at_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101)
+        return np.asarray(values, np.float32).reshape(shape)
 
     if not len(found):
         return np.zeros((0, 4, 4))
@@ -47,4 +48,6 @@ def blur_products(first: NDArray[np.float32], second: NDArray[np.float32], found
     gram, count = np.asarray(flat @ flat.swapaxes(1, 2), np.float64), len(left_out)
     inner = gram[:, :count, :count]
     inner[:, range(count), range(count)] += 1e-6 * np.trace(inner, axis1=1, axis2=2)[:, None] / count
-    return np.asarray(gram[:, count:, count:] - gram[:, count:, :count] @ np.linalg.solve(inner, gram[:, :count, count:]))
+    return np.asarray(
+        gram[:, count:, count:] - gram[:, count:, :count] @ np.linalg.solve(inner, gram[:, :count, count:])
+    )

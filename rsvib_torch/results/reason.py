@@ -215,7 +215,8 @@ _TONES = {
     "tone_changes": _px(
         "tone of {frequency:.4g} Hz changes by {value:.2g} px faster than it is followed, {limit:.2g} px are allowed",
         "if frames are missing, use the video as the camera recorded it",
-        "what a spline does not follow of the largest tone of a video, above a third of its mean amplitude",
+        "what a spline does not follow of the largest tone of a video, above a third of its mean amplitude, or above a "
+        "tenth if its phase jumps from a frame to the next one",
     ),
     "tone_averaged_out": ReasonKind(
         "tone of {value:.4g} Hz is above 1/T_e = {limit:.4g} Hz, where the exposure averages it out",

@@ -45,6 +45,9 @@ _NEARLY_BLIND, _MAX_APART = 0.5, 0.1
 # 40 clips, 0.23 in nearly dark ones
 _MOST_APART = 0.5
 SIGNIFICANT = 3.0  # standard deviations of a tone
+_CERTAIN = (
+    10.0  # standard deviations of a jump of its phase: at most 10 of 76 tones in H.264, 23 to 58 beside missing frames
+)
 _MIN_SHARE = 2e-3  # of the largest variance that a tone of 1 px causes; others are hidden by the path
 _MIN_SINC = 0.1  # of the amplitude that remains in the mean over the exposure
 # rows of the patch of a corner, over which its displacement is a mean: amplitudes of 52 to 205 Hz are then right within
@@ -93,6 +96,7 @@ class WindowTone:
     amplitude_std: float = math.inf  # px
     frequency_std: float = math.inf  # Hz
     apart: float = 0.0  # largest part of the tone that is left in a third of the rows or columns
+    jump: float = 0.0  # rad, largest significant change of its phase from a frame to the next one that is not followed
 
     @property
     def size(self) -> float:
@@ -117,7 +121,7 @@ class WindowTone:
         rate_std = math.hypot(self.frequency_std, phase / (2 * math.pi * self.step * (len(self.knots) - 3)))
         return Tone(self.axis, frequency, complex(weight * turned), weight * size_std, rate_std)
 
-    def waves(self, times: Array, averaged: Averaged) -> NDArray[np.complex128]:
+    def waves(self, times: Array, averaged: Averaged | tuple[()]) -> NDArray[np.complex128]:
         """Values at times, averaged over the exposure and the patch of a corner, of an amplitude of 1."""
         frequency = self.frequency + self.slope * times if self.slope else np.array(self.frequency)
         attenuation = np.prod([np.sinc(frequency * seconds) for seconds in averaged], 0)
@@ -444,18 +448,18 @@ class WindowFit:
         waves, residual = [], self.corners.offsets - self.explained(self.knots)
         for tone in self.tones:
             index, factors = self._envelope(self.times)
-            wave = tone.waves(self.times, self.averaged) * (factors * tone.knots[index]).sum(-1)
-            waves.append(wave[:, 1] - wave[:, 0])
-            residual[:, tone.axis] -= waves[-1].real
+            waves.append(tone.waves(self.times, self.averaged) * (factors * tone.knots[index]).sum(-1))
+            residual[:, tone.axis] -= (waves[-1][:, 1] - waves[-1][:, 0]).real
         root = np.sqrt(self.weights)
         # thirds of the rows and of the columns: roll and zoom displace opposite sides in opposite directions
         across = self.corners.places[:, 0]
         sides = np.stack([self.corners.rows, (across - across.min()) / max(float(np.ptp(across)), 1.0)])
         thirds = np.minimum(3 * sides, 2).astype(np.int64)
         parts = [of_side == third for of_side in thirds for third in range(3)]
-        for tone, wave in zip(self.tones, waves, strict=True):
-            columns = root[:, None] * np.stack([wave.real, -wave.imag], -1)
+        for tone, (early, late) in zip(self.tones, (wave.T for wave in waves), strict=True):
+            columns = root[:, None] * np.stack([(late - early).real, (early - late).imag], -1)
             left = root * residual[:, tone.axis]
+            tone.jump = self._jump(root, columns[:, 1], -0.5 * root * (early + late).imag, left)
             fits = [np.linalg.lstsq(columns[part], left[part])[0] for part in parts]
             tone.apart = max(float(np.hypot(*solution)) for solution in fits)
 
@@ -466,10 +470,25 @@ class WindowFit:
                 is_visible
                 and tone.apart < _MOST_APART
                 and tone.size > SIGNIFICANT * tone.amplitude_std
-                and 0.5 * np.square(np.abs(wave)).mean() > _MIN_EXPLAINED**2
+                and 0.5 * np.square(np.abs(wave[:, 1] - wave[:, 0])).mean() > _MIN_EXPLAINED**2
             )
 
         self.tones = [tone for tone, wave in zip(self.tones, waves, strict=True) if is_kept(tone, wave)]
+
+    def _jump(self, root: Array, turned: Array, parted: Array, left: Array) -> float:
+        """``WindowTone.jump``, from what is left of the offsets (N,), times the root of their weights.
+
+        Offsets change by ``turned`` (N,) if the phase changes by 1 rad in both frames, and by ``parted`` (N,) if it
+        does so between them. Beside these, a path of the pair is a polynomial over the rows.
+        """
+        polynomial = root[:, None] * (self.corners.rows[:, None] - 0.5) ** np.arange(4)
+        columns, largest = np.concatenate([polynomial, np.stack([turned, parted, left], -1)], 1), 0.0
+        for part, *_ in self.pairs:
+            if (freedom := part.stop - part.start - 6) > 15:
+                triangle = np.asarray(np.linalg.qr(columns[part], "r"))
+                if abs(triangle[5, 6]) > _CERTAIN * abs(triangle[6, 6]) / math.sqrt(freedom):
+                    largest = max(largest, abs(float(triangle[5, 6] / triangle[5, 5])))
+        return largest
 
     def path(
         self,

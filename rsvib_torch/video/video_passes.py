@@ -49,6 +49,9 @@ _GAIN_ERROR = 0.02  # of an amplitude: the mean over the patch of a corner is kn
 # path. 36 tones of 33 to 177 Hz and 0.4 to 2.5 px behind 4 ms: 0.07 to 0.34, amplitudes were up to 15 % too large
 _BLUR_BIAS = 0.15
 _SAME_ALIAS = 0.01  # periods per frame; tones are separated from 0.02 on in a window of 96 frames
+# rad, of the phase of a tone from a frame to the next one: with every seventh frame missing, 93.0 and 121.0 Hz were
+# stated as 93.47 and 121.15 Hz and jumped by 0.37 and 0.22 rad
+_MAX_JUMP = 0.1
 _MAX_APART = 0.25  # of a tone, left in a third of the rows or columns: up to 0.14 of tones of cameras, at night
 # Of the usual change from frame to frame: at least 0.18 in 36 clips that a hand holds, and at most 0.12 of copies in a
 # video of 24 frames per second that is stored as 30. More frames in a row are no copies: a pan has ended, or it is dark
@@ -394,9 +397,15 @@ class VideoPasses:
             # Where frames are missing, the phase of a tone jumps, and others of 0.1 to 0.2 px seem to be beside it:
             # 0.75 to 0.8 of the tone are not followed, of one that is switched on and off 0.6, at most 0.21 in 14 clips
             largest = max(of_window, key=lambda tone: tone.size, default=None)
-            if largest is not None and largest.bend() > (limit := largest.size / SIGNIFICANT):
-                frequency = {"frequency": largest.frequency}
-                against = [Reason("tone_changes", name, largest.bend(), limit, frequency), *aliases[:1]]
+            if largest is not None:
+                changes = (
+                    (largest.bend(), largest.size / SIGNIFICANT),
+                    (largest.jump * largest.size, _MAX_JUMP * largest.size),
+                )
+                change, limit = max(changes, key=lambda both: both[0] / both[1])
+                if change > limit:
+                    frequency = {"frequency": largest.frequency}
+                    against = [Reason("tone_changes", name, change, limit, frequency), *aliases[:1]]
             if apart > _MAX_APART:
                 against.append(Reason("rows_differ", name, apart, _MAX_APART))
             fastest = max((tone.frequency for tone in of_axis), default=0.0)
