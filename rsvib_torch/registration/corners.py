@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rsvib_torch.motion.camera import displacement_factors
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array, table, tensor
-from rsvib_torch.registration.patch_blur import blur_products, smoothed
+from rsvib_torch.registration.patch_blur import blur_products
 
 Grey = NDArray[np.uint8]
 Points = NDArray[np.float64]  # (N, 2) px, (x, y) from the middle of the first pixel
@@ -63,7 +63,7 @@ class Corners:
     places: Array  # (N, 2) px from the centre of the frame, (x, y), mean of both frames
     offsets: Array  # (N, 2) px
     layer: NDArray[np.bool_]  # (N,) whether they move with the part of the scene that most corners have moved with
-    blur: Array  # (N, 4, 4), see ``blur_products``
+    blur: Array  # (N, 4, 4), ``blur_products`` of their patches; zeros if blur is not compared
 
     @property
     def factors(self) -> Array:
@@ -90,13 +90,15 @@ class CornerFollower:
         consistent: Whether to keep only the corners that move with most others, to follow the same ones as long as they
             are seen, and to do this in frames of reduced size if these are large. Otherwise every frame has its own
             corners, whose errors are independent of those before.
+        compare_blur: Whether to compare the blur of the corners, which takes a fifth of the time.
     """
 
-    def __init__(self, timing: SensorTiming, *, most: int = 256, consistent: bool = True) -> None:
-        self._timing, self._most, self._consistent = timing, most, consistent
+    def __init__(
+        self, timing: SensorTiming, *, most: int = 256, consistent: bool = True, compare_blur: bool = False
+    ) -> None:
+        self._timing, self._most, self._consistent, self._compare_blur = timing, most, consistent, compare_blur
         self._start = 0.0  # s, of the frame before
-        # the frame before, of reduced size, and its mask, and how its blur is compared
-        self._before: tuple[Grey, Grey | None, NDArray[np.float32]] | None = None
+        self._before: tuple[Grey, Grey | None] | None = None  # the frame before, of reduced size, and its mask
         self._known, self._votes = _NO_CORNERS  # corners in it, and the votes of each of them, see ``_in_layer``
 
     def next(self, grey: Grey, start: float, mask: Grey | None = None) -> Corners | None:
@@ -114,7 +116,7 @@ class CornerFollower:
             around = cv2.blur(second, (_AROUND, _AROUND))
             second = np.asarray(cv2.addWeighted(second, 1.0, around, -1.0, 128.0), np.uint8)
         starts = np.array([self._start, start])
-        self._before, self._start = (second, mask, smoothed(second)), start
+        self._before, self._start = (second, mask), start
         self._known, self._votes = _NO_CORNERS
         if before is None:
             return None
@@ -139,7 +141,7 @@ class CornerFollower:
             found, ends, votes = found[agree], ends[agree], votes[agree]
             layer = _in_layer(found, ends, votes, scale)
             self._known, self._votes = ends, np.where(layer, votes + 1, np.minimum(votes, 0) - 1)
-        blur = blur_products(before[2], self._before[2], found, ends)
+        blur = blur_products(before[0], second, found, ends) if self._compare_blur else np.zeros((len(found), 4, 4))
         found, ends = ((points + 0.5) * scale - 0.5 for points in (found, ends))
         # 3. The times of their rows.
         rows = np.stack([found[:, axis], ends[:, axis]], -1)

@@ -264,9 +264,9 @@ _TONES = {
     ),
     "blur_contradicts_exposure": _of_all_axes(
         "the difference of the blur between frames is {value:.3g} times the value expected for an exposure of "
-        "{exposure_rows:.4g} rows[ ({exposure_ms:.3g} ms)], the limit is {limit:g}",
-        "check exposure_rows[ (about {likely:.2g} rows agree with the blur)][ (about {likely_ms:.2g} ms agree with the "
-        "blur, or more, if compression hides a part of it)], and frame_rows and row_time, which "
+        "{exposure_rows:.4g} rows[ ({exposure_ms:.3g} ms)], the limit is {limit:g}[; about {likely_ms:.2g} ms agree "
+        "with the blur, or more if compression hides a part of it]",
+        "check exposure_rows[ (about {likely:.2g} rows agree with the blur)], and frame_rows and row_time, which "
         "determine the motion[; the compression of a {compressed}, which makes frames alike, is another cause]",
         "difference of the blur between frames over the expected one, significantly between -0.3 and 0.6 or above 2",
     ),

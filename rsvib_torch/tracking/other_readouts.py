@@ -182,7 +182,7 @@ def compared_readouts(fit: WindowFit, timing: SensorTiming, size: tuple[int, int
         most = _AS_WELL * fit.unexplained if fit.tones else 0.0
         agreeing = [part for (of, part), value in left.items() if of is rows and 0 < part != 1 and value < most]
         of_agreeing = tuple(map(with_its_tones, sorted(agreeing, key=lambda one: abs(math.log(one)))))
-        return fit.path(blur=blur_ratio(fit, timing, size) if fit.tones else (math.nan, math.nan), agreeing=of_agreeing)
+        return fit.path(blur=blur_ratio(fit, timing, size) if fit.tones else (0.0, 0.0), agreeing=of_agreeing)
     # 3. Frames whose columns are read one after another are moved as a whole.
     most = _CONTRADICTED * left[of, part]
     alike = sorted((value, one) for (its, one), value in left.items() if its is of is rows and value < most)

@@ -20,7 +20,7 @@ def blur_ratio(fit: WindowFit, timing: SensorTiming, size: tuple[int, int]) -> t
     corners, times, scale = fit.corners, fit.times, reduction(*size)
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     seconds, weights = 0.5 * timing.exposure_time * nodes, 0.5 * weights
-    window, (index, values) = fit.path(), fit._envelope(times)
+    window, (index, values) = fit.path(), fit.envelope(times)
     velocity = np.stack([window.path(at, 1) for at in corners.times.T], 1) @ corners.factors.swapaxes(1, 2)
     path = velocity[:, :, None] * seconds[:, None]  # (N, 2, nodes, 2)
     for tone in fit.tones:
@@ -42,10 +42,8 @@ def blur_ratio(fit: WindowFit, timing: SensorTiming, size: tuple[int, int]) -> t
     columns = np.concatenate([changes, np.broadcast_to(np.eye(3), (len(times), 3, 3))], 1)
     heavy = fit.weights[:, None, None] * columns @ corners.blur[:, :3]
     starts = [part.start for part, _, _ in fit.pairs]
-    normal, right = (
-        np.add.reduceat(heavy[..., :3] @ columns.swapaxes(1, 2), starts),
-        np.add.reduceat(heavy[..., 3:], starts),
-    )
+    normal = np.add.reduceat(heavy[..., :3] @ columns.swapaxes(1, 2), starts)
+    right = np.add.reduceat(heavy[..., 3:], starts)
     inner = normal[:, 2:, 2:] + 1e-9 * (np.trace(normal[:, 2:, 2:], axis1=1, axis2=2)[:, None, None] + 1e-9) * np.eye(3)
     rest = np.concatenate([normal[:, :2, :2], right[:, :2]], 2)
     of_pairs = rest - normal[:, :2, 2:] @ np.linalg.solve(inner, np.concatenate([normal[:, 2:, :2], right[:, 2:]], 2))

@@ -191,7 +191,7 @@ class WindowPath:
     other_readout: tuple[str, float, float] | None
     # part of the stated time of the readout, by which the path and the tones displace the rows; 0: as columns do
     part: float
-    blur: tuple[float, float]  # ``window_blur.blur_ratio``; NaN without tones
+    blur: tuple[float, float]  # ``blur_ratio``; 0 if it is unknown
     agreeing: tuple[str, ...]  # other readouts that explain the corners as well, and the frequencies of their tones
 
     def path(self, times: Array, derivative: int = 0) -> Array:
@@ -290,7 +290,7 @@ class WindowFit:
         self.pairs: list[tuple[slice, NDArray[np.int64], Array]] = []  # corners, unknowns, columns (2, n, unknowns)
         self.envelope_step = _ENVELOPE * interval
         self.envelope_knots = max(4, math.ceil((end - self.start) / self.envelope_step) + 3)
-        taps = self._envelope(self.times)
+        taps = self.envelope(self.times)
         self.envelopes: list[tuple[NDArray[np.int64], Array]] = []  # knots of a tone, and their values (n, 2, knots)
         ends = np.append(np.nonzero(np.diff(corners.pairs))[0] + 1, len(factors))
         for begin, stop in pairwise((0, *ends)):
@@ -318,7 +318,7 @@ class WindowFit:
             offsets[part] = (columns @ knots.ravel()[unknowns]).T
         return offsets
 
-    def _envelope(self, times: Array) -> tuple[NDArray[np.int64], Array]:
+    def envelope(self, times: Array) -> tuple[NDArray[np.int64], Array]:
         """Knots of a tone at times in s from the middle, and their values."""
         return spline_taps(times, self.start - self.origin, self.envelope_step, self.envelope_knots)
 
@@ -447,7 +447,7 @@ class WindowFit:
         """Leave out insignificant tones, and those that thirds of the rows or columns contradict."""
         waves, residual = [], self.corners.offsets - self.explained(self.knots)
         for tone in self.tones:
-            index, factors = self._envelope(self.times)
+            index, factors = self.envelope(self.times)
             waves.append(tone.waves(self.times, self.averaged) * (factors * tone.knots[index]).sum(-1))
             residual[:, tone.axis] -= (waves[-1][:, 1] - waves[-1][:, 0]).real
         root = np.sqrt(self.weights)
@@ -495,7 +495,7 @@ class WindowFit:
         other_readout: tuple[str, float, float] | None = None,
         *,
         part: float = 1.0,
-        blur: tuple[float, float] = (math.nan, math.nan),
+        blur: tuple[float, float] = (0.0, 0.0),
         agreeing: tuple[str, ...] = (),
     ) -> WindowPath:
         """The result of the fit; the arguments are those of ``WindowPath``."""
@@ -549,7 +549,7 @@ class WindowFit:
         times, root = np.stack([early, late], -1), np.sqrt(total)
         # 2. Project out what the path and the tones so far explain.
         basis = _differences(*spline_taps(times + self.origin, self.start, self.step, self.count), self.count)
-        values = _basis(*self._envelope(times), self.envelope_knots)
+        values = _basis(*self.envelope(times), self.envelope_knots)
         tones = [_wave_columns(tone.waves(times, self.averaged), values) for tone in self.tones if tone.axis == axis]
         known = np.concatenate([basis, *tones], 1) * root[:, None]
         gram = known.T @ known

@@ -431,7 +431,7 @@ class _FirstPass:
         self._before: tuple[int, NDArray[np.uint8]] | None = None  # the usable frame before, and its number
         self._changes: deque[float] = deque(maxlen=_MEMORY)  # counts, of the frames before
         self._waiting: list[tuple[int, NDArray[np.uint8], float]] = []  # possible copies of it, and their changes
-        self._follower = CornerFollower(self._timing)
+        self._follower = CornerFollower(self._timing, compare_blur=video.rates is None and not video.stabilised)
 
     @property
     def cuts(self) -> list[int]:
