@@ -265,7 +265,7 @@ def test_tones_whose_phase_jumps_at_missing_frames_are_not_reliable(tmp_path):
 
 @pytest.mark.parametrize("stated", [0.3, 1.0])
 def test_a_stated_exposure_that_is_too_short_for_the_blur_is_refused(blurred, tmp_path, stated):
-    """An exposure of 3 ms, stated as 0.9 ms: amplitudes are 4 to 8 % too small, and nothing else shows it."""
+    """An exposure of 3 ms, stated as 0.9 ms: amplitudes are 3 to 6 % too small, and nothing else shows it."""
     timing = replace(LONG, exposure_rows=stated * LONG.exposure_rows)
     report = process_video(blurred, tmp_path / "still.mp4", timing, **OPTIONS)
     (found,) = read_manifest(report.manifest).detections()
