@@ -113,7 +113,7 @@ def _reasons_against_stack(stack: Table, timing: RowTiming, max_tones: float, le
         what = "the rows of some frames" if by_rows else f"{stack['bands']:g} row bands"
         of_all = [Reason("rows_not_registered", None, stack["measured"], _MIN_MEASURED, {"what": what})]
     if by_rows:
-        of_all += _exposure_reasons(timing, *stack["blur"])
+        of_all += exposure_reasons(timing, *stack["blur"])
     against = []
     for axis, name in enumerate(AXIS_NAMES[:axes]):
         numbers = {quantity: values[axis] for quantity, values in stack.items() if quantity not in _OF_STACK}
@@ -310,24 +310,29 @@ def rotation_reasons(axis: int, axes: int, differential: Sequence[float], size: 
 # Exposure
 
 
-def _exposure_reasons(timing: RowTiming, ratio: float, std: float, size: float) -> list[Reason]:
+def exposure_reasons(timing: RowTiming, ratio: float, std: float, size: float | None = None) -> list[Reason]:
     """Reasons against all axes from the difference of the blur between frames.
 
     Its ratio to the expected one is the square of the ratio of the exposure times (docs/verdicts.md). A stated exposure
     that is far too short expects nearly no blur, so that what counts is the size of the measured difference. Sizes
     above 0.25 of the detail are beyond the second order, with which ratios of 0.5 to 1.5 were measured for sizes of
     0.05 and more. Negative ratios are caused by another error, because no exposure time gives them. H.264 predicts
-    frames from others and lowers the ratio, from 1.06 to 0.94, 0.61 and 0.23 with CRF 10, 17 and 23.
+    frames from others and lowers the ratio, from 1.06 to 0.94, 0.61 and 0.23 with CRF 10, 17 and 23: without a size,
+    frames are those of a video, and only a large ratio is a reason.
     """
     low, high = 0.6, 2.0
-    is_low = -0.3 < ratio < low and 1 - ratio > 3 * std and size > 0.002
-    is_high = ratio > high and ratio - 1 > 4 * std and (ratio - 1) * size > 0.002
-    if size >= 0.25 or not (is_low or is_high):
+    is_low, is_high = False, ratio > high and ratio - 1 > 4 * std
+    if size is not None:
+        is_low = -0.3 < ratio < low and 1 - ratio > 3 * std and 0.002 < size < 0.25
+        is_high = is_high and (ratio - 1) * size > 0.002 and size < 0.25
+    if not (is_low or is_high):
         return []
     details: dict[str, float | str] = {"exposure_rows": timing.exposure_rows}
     likely = timing.exposure_rows * math.sqrt(max(ratio, 0.0))
     if 0 < likely * timing.row_time <= timing.frame_period:  # longer ones are no exposures; another error is the cause
-        details["likely"] = likely
+        details |= {"likely": likely} if size is not None else {"likely_ms": 1e3 * likely * timing.row_time}
+    if size is None:
+        details["exposure_ms"] = 1e3 * timing.exposure_time
     if is_low:
         details["compressed"] = "video"
     return [Reason("blur_contradicts_exposure", None, ratio, low if is_low else high, details)]

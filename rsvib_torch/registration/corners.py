@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rsvib_torch.motion.camera import displacement_factors
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array, table, tensor
+from rsvib_torch.registration.patch_blur import blur_products
 
 Grey = NDArray[np.uint8]
 Points = NDArray[np.float64]  # (N, 2) px, (x, y) from the middle of the first pixel
@@ -62,6 +63,7 @@ class Corners:
     places: Array  # (N, 2) px from the centre of the frame, (x, y), mean of both frames
     offsets: Array  # (N, 2) px
     layer: NDArray[np.bool_]  # (N,) whether they move with the part of the scene that most corners have moved with
+    blur: Array  # (N, 4, 4), ``blur_products`` of their patches; zeros if blur is not compared
 
     @property
     def factors(self) -> Array:
@@ -73,7 +75,9 @@ class Corners:
     def joined(parts: Sequence["Corners"]) -> "Corners":
         """The corners of all pairs."""
         pairs = np.concatenate([np.full(len(part.rows), number) for number, part in enumerate(parts)])
-        rest = ([getattr(part, name) for part in parts] for name in ("rows", "times", "places", "offsets", "layer"))
+        rest = (
+            [getattr(part, name) for part in parts] for name in ("rows", "times", "places", "offsets", "layer", "blur")
+        )
         return Corners(pairs, *(np.concatenate(values) for values in rest))
 
 
@@ -86,10 +90,13 @@ class CornerFollower:
         consistent: Whether to keep only the corners that move with most others, to follow the same ones as long as they
             are seen, and to do this in frames of reduced size if these are large. Otherwise every frame has its own
             corners, whose errors are independent of those before.
+        compare_blur: Whether to compare the blur of the corners, which takes a fifth of the time.
     """
 
-    def __init__(self, timing: SensorTiming, *, most: int = 256, consistent: bool = True) -> None:
-        self._timing, self._most, self._consistent = timing, most, consistent
+    def __init__(
+        self, timing: SensorTiming, *, most: int = 256, consistent: bool = True, compare_blur: bool = False
+    ) -> None:
+        self._timing, self._most, self._consistent, self._compare_blur = timing, most, consistent, compare_blur
         self._start = 0.0  # s, of the frame before
         self._before: tuple[Grey, Grey | None] | None = None  # the frame before, of reduced size, and its mask
         self._known, self._votes = _NO_CORNERS  # corners in it, and the votes of each of them, see ``_in_layer``
@@ -134,13 +141,14 @@ class CornerFollower:
             found, ends, votes = found[agree], ends[agree], votes[agree]
             layer = _in_layer(found, ends, votes, scale)
             self._known, self._votes = ends, np.where(layer, votes + 1, np.minimum(votes, 0) - 1)
+        blur = blur_products(before[0], second, found, ends) if self._compare_blur else np.zeros((len(found), 4, 4))
         found, ends = ((points + 0.5) * scale - 0.5 for points in (found, ends))
         # 3. The times of their rows.
         rows = np.stack([found[:, axis], ends[:, axis]], -1)
         rows = rows if timing.readout_direction == "forward" else count - 1 - rows
         times = starts + rows * timing.row_time + 0.5 * timing.exposure_time
         places = 0.5 * (found + ends) - 0.5 * (np.array([width, height]) - 1)
-        return Corners(np.zeros(len(found), np.int64), rows[:, 0] / count, times, places, ends - found, layer)
+        return Corners(np.zeros(len(found), np.int64), rows[:, 0] / count, times, places, ends - found, layer, blur)
 
 
 def _agreeing(found: Points, ends: Points, axis: int, length: int, scale: int) -> NDArray[np.bool_]:

@@ -215,7 +215,8 @@ _TONES = {
     "tone_changes": _px(
         "tone of {frequency:.4g} Hz changes by {value:.2g} px faster than it is followed, {limit:.2g} px are allowed",
         "if frames are missing, use the video as the camera recorded it",
-        "what a spline does not follow of the largest tone of a video, above a third of its mean amplitude",
+        "what a spline does not follow of the largest tone of a video, above a third of its mean amplitude, or above a "
+        "tenth if its phase jumps from a frame to the next one",
     ),
     "tone_averaged_out": ReasonKind(
         "tone of {value:.4g} Hz is above 1/T_e = {limit:.4g} Hz, where the exposure averages it out",
@@ -263,7 +264,8 @@ _TONES = {
     ),
     "blur_contradicts_exposure": _of_all_axes(
         "the difference of the blur between frames is {value:.3g} times the value expected for an exposure of "
-        "{exposure_rows:g} rows, the limit is {limit:g}",
+        "{exposure_rows:.4g} rows[ ({exposure_ms:.3g} ms)], the limit is {limit:g}[; about {likely_ms:.2g} ms agree "
+        "with the blur, or more if compression hides a part of it]",
         "check exposure_rows[ (about {likely:.2g} rows agree with the blur)], and frame_rows and row_time, which "
         "determine the motion[; the compression of a {compressed}, which makes frames alike, is another cause]",
         "difference of the blur between frames over the expected one, significantly between -0.3 and 0.6 or above 2",

@@ -15,6 +15,7 @@ import numpy as np
 
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array
+from rsvib_torch.tracking.window_blur import blur_ratio
 from rsvib_torch.tracking.window_fit import MIN_RATIO, ROUNDS, SearchedFrequencies, WindowFit, WindowPath
 
 _WITHOUT_TONES = 0.5, 0.7, 1.4, 2.0  # parts of the time of a readout that are compared where there are no tones
@@ -180,7 +181,8 @@ def compared_readouts(fit: WindowFit, timing: SensorTiming, size: tuple[int, int
     if least > fit.unexplained or least > rows.with_part(1.0, ROUNDS).unexplained:
         most = _AS_WELL * fit.unexplained if fit.tones else 0.0
         agreeing = [part for (of, part), value in left.items() if of is rows and 0 < part != 1 and value < most]
-        return fit.path(agreeing=tuple(map(with_its_tones, sorted(agreeing, key=lambda one: abs(math.log(one))))))
+        of_agreeing = tuple(map(with_its_tones, sorted(agreeing, key=lambda one: abs(math.log(one)))))
+        return fit.path(blur=blur_ratio(fit, timing, size) if fit.tones else (0.0, 0.0), agreeing=of_agreeing)
     # 3. Frames whose columns are read one after another are moved as a whole.
     most = _CONTRADICTED * left[of, part]
     alike = sorted((value, one) for (its, one), value in left.items() if its is of is rows and value < most)

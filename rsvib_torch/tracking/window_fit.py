@@ -45,6 +45,9 @@ _NEARLY_BLIND, _MAX_APART = 0.5, 0.1
 # 40 clips, 0.23 in nearly dark ones
 _MOST_APART = 0.5
 SIGNIFICANT = 3.0  # standard deviations of a tone
+_CERTAIN = (
+    10.0  # standard deviations of a jump of its phase: at most 10 of 76 tones in H.264, 23 to 58 beside missing frames
+)
 _MIN_SHARE = 2e-3  # of the largest variance that a tone of 1 px causes; others are hidden by the path
 _MIN_SINC = 0.1  # of the amplitude that remains in the mean over the exposure
 # rows of the patch of a corner, over which its displacement is a mean: amplitudes of 52 to 205 Hz are then right within
@@ -93,6 +96,7 @@ class WindowTone:
     amplitude_std: float = math.inf  # px
     frequency_std: float = math.inf  # Hz
     apart: float = 0.0  # largest part of the tone that is left in a third of the rows or columns
+    jump: float = 0.0  # rad, largest significant change of its phase from a frame to the next one that is not followed
 
     @property
     def size(self) -> float:
@@ -117,7 +121,7 @@ class WindowTone:
         rate_std = math.hypot(self.frequency_std, phase / (2 * math.pi * self.step * (len(self.knots) - 3)))
         return Tone(self.axis, frequency, complex(weight * turned), weight * size_std, rate_std)
 
-    def waves(self, times: Array, averaged: Averaged) -> NDArray[np.complex128]:
+    def waves(self, times: Array, averaged: Averaged | tuple[()]) -> NDArray[np.complex128]:
         """Values at times, averaged over the exposure and the patch of a corner, of an amplitude of 1."""
         frequency = self.frequency + self.slope * times if self.slope else np.array(self.frequency)
         attenuation = np.prod([np.sinc(frequency * seconds) for seconds in averaged], 0)
@@ -187,6 +191,7 @@ class WindowPath:
     other_readout: tuple[str, float, float] | None
     # part of the stated time of the readout, by which the path and the tones displace the rows; 0: as columns do
     part: float
+    blur: tuple[float, float]  # ``blur_ratio``; 0 if it is unknown
     agreeing: tuple[str, ...]  # other readouts that explain the corners as well, and the frequencies of their tones
 
     def path(self, times: Array, derivative: int = 0) -> Array:
@@ -285,7 +290,7 @@ class WindowFit:
         self.pairs: list[tuple[slice, NDArray[np.int64], Array]] = []  # corners, unknowns, columns (2, n, unknowns)
         self.envelope_step = _ENVELOPE * interval
         self.envelope_knots = max(4, math.ceil((end - self.start) / self.envelope_step) + 3)
-        taps = self._envelope(self.times)
+        taps = self.envelope(self.times)
         self.envelopes: list[tuple[NDArray[np.int64], Array]] = []  # knots of a tone, and their values (n, 2, knots)
         ends = np.append(np.nonzero(np.diff(corners.pairs))[0] + 1, len(factors))
         for begin, stop in pairwise((0, *ends)):
@@ -313,7 +318,7 @@ class WindowFit:
             offsets[part] = (columns @ knots.ravel()[unknowns]).T
         return offsets
 
-    def _envelope(self, times: Array) -> tuple[NDArray[np.int64], Array]:
+    def envelope(self, times: Array) -> tuple[NDArray[np.int64], Array]:
         """Knots of a tone at times in s from the middle, and their values."""
         return spline_taps(times, self.start - self.origin, self.envelope_step, self.envelope_knots)
 
@@ -442,19 +447,19 @@ class WindowFit:
         """Leave out insignificant tones, and those that thirds of the rows or columns contradict."""
         waves, residual = [], self.corners.offsets - self.explained(self.knots)
         for tone in self.tones:
-            index, factors = self._envelope(self.times)
-            wave = tone.waves(self.times, self.averaged) * (factors * tone.knots[index]).sum(-1)
-            waves.append(wave[:, 1] - wave[:, 0])
-            residual[:, tone.axis] -= waves[-1].real
+            index, factors = self.envelope(self.times)
+            waves.append(tone.waves(self.times, self.averaged) * (factors * tone.knots[index]).sum(-1))
+            residual[:, tone.axis] -= (waves[-1][:, 1] - waves[-1][:, 0]).real
         root = np.sqrt(self.weights)
         # thirds of the rows and of the columns: roll and zoom displace opposite sides in opposite directions
         across = self.corners.places[:, 0]
         sides = np.stack([self.corners.rows, (across - across.min()) / max(float(np.ptp(across)), 1.0)])
         thirds = np.minimum(3 * sides, 2).astype(np.int64)
         parts = [of_side == third for of_side in thirds for third in range(3)]
-        for tone, wave in zip(self.tones, waves, strict=True):
-            columns = root[:, None] * np.stack([wave.real, -wave.imag], -1)
+        for tone, (early, late) in zip(self.tones, (wave.T for wave in waves), strict=True):
+            columns = root[:, None] * np.stack([(late - early).real, (early - late).imag], -1)
             left = root * residual[:, tone.axis]
+            tone.jump = self._jump(root, columns[:, 1], -0.5 * root * (early + late).imag, left)
             fits = [np.linalg.lstsq(columns[part], left[part])[0] for part in parts]
             tone.apart = max(float(np.hypot(*solution)) for solution in fits)
 
@@ -465,16 +470,32 @@ class WindowFit:
                 is_visible
                 and tone.apart < _MOST_APART
                 and tone.size > SIGNIFICANT * tone.amplitude_std
-                and 0.5 * np.square(np.abs(wave)).mean() > _MIN_EXPLAINED**2
+                and 0.5 * np.square(np.abs(wave[:, 1] - wave[:, 0])).mean() > _MIN_EXPLAINED**2
             )
 
         self.tones = [tone for tone, wave in zip(self.tones, waves, strict=True) if is_kept(tone, wave)]
+
+    def _jump(self, root: Array, turned: Array, parted: Array, left: Array) -> float:
+        """``WindowTone.jump``, from what is left of the offsets (N,), times the root of their weights.
+
+        Offsets change by ``turned`` (N,) if the phase changes by 1 rad in both frames, and by ``parted`` (N,) if it
+        does so between them. Beside these, a path of the pair is a polynomial over the rows.
+        """
+        polynomial = root[:, None] * (self.corners.rows[:, None] - 0.5) ** np.arange(4)
+        columns, largest = np.concatenate([polynomial, np.stack([turned, parted, left], -1)], 1), 0.0
+        for part, *_ in self.pairs:
+            if (freedom := part.stop - part.start - 6) > 15:
+                triangle = np.asarray(np.linalg.qr(columns[part], "r"))
+                if abs(triangle[5, 6]) > _CERTAIN * abs(triangle[6, 6]) / math.sqrt(freedom):
+                    largest = max(largest, abs(float(triangle[5, 6] / triangle[5, 5])))
+        return largest
 
     def path(
         self,
         other_readout: tuple[str, float, float] | None = None,
         *,
         part: float = 1.0,
+        blur: tuple[float, float] = (0.0, 0.0),
         agreeing: tuple[str, ...] = (),
     ) -> WindowPath:
         """The result of the fit; the arguments are those of ``WindowPath``."""
@@ -483,7 +504,7 @@ class WindowFit:
         if not self.layer.all():  # with a subject on 40 % of the frame, tones of 0.1 px were found that are none
             residual_of_most = float(np.quantile(self.distance, 0.8)) / _FOUR_FIFTHS
         of_window, of_fit = (self.origin, self.start, self.step, knots, tuple(self.tones)), (residual, residual_of_most)
-        return WindowPath(*of_window, *of_fit, other_readout, part, agreeing)
+        return WindowPath(*of_window, *of_fit, other_readout, part, blur, agreeing)
 
     def is_apart_from(self, frequency: float, others: Array) -> NDArray[np.bool_]:
         """Whether other frequencies are not those of a tone, nor of a change of its amplitude."""
@@ -528,7 +549,7 @@ class WindowFit:
         times, root = np.stack([early, late], -1), np.sqrt(total)
         # 2. Project out what the path and the tones so far explain.
         basis = _differences(*spline_taps(times + self.origin, self.start, self.step, self.count), self.count)
-        values = _basis(*self._envelope(times), self.envelope_knots)
+        values = _basis(*self.envelope(times), self.envelope_knots)
         tones = [_wave_columns(tone.waves(times, self.averaged), values) for tone in self.tones if tone.axis == axis]
         known = np.concatenate([basis, *tones], 1) * root[:, None]
         gram = known.T @ known

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from rsvib_torch.detection.sensitivity import timing_sensitivity, with_row_time_std
 from rsvib_torch.detection.tones.fit import ToneFit
+from rsvib_torch.detection.verdict import exposure_reasons
 from rsvib_torch.execution.parallel import ONE_BLAS_THREAD, prefetched
 from rsvib_torch.gyroscope.corner_tracks import followed_pair, tracks_of_pairs
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
@@ -34,7 +35,7 @@ from rsvib_torch.stacks.recorded_motion import compared_pairs
 from rsvib_torch.stacks.windows import WindowRecord
 from rsvib_torch.text import number_of
 from rsvib_torch.tracking.camera_path import WINDOW_FRAMES, CameraPath, camera_path, shake
-from rsvib_torch.tracking.window_fit import SIGNIFICANT, Tone, WindowPath
+from rsvib_torch.tracking.window_fit import SIGNIFICANT, Tone, WindowPath, WindowTone
 from rsvib_torch.video import Margins
 from rsvib_torch.video.recorded_rotation import RecordedRotation
 from rsvib_torch.video.steadying import steady_shifts
@@ -48,6 +49,9 @@ _GAIN_ERROR = 0.02  # of an amplitude: the mean over the patch of a corner is kn
 # path. 36 tones of 33 to 177 Hz and 0.4 to 2.5 px behind 4 ms: 0.07 to 0.34, amplitudes were up to 15 % too large
 _BLUR_BIAS = 0.15
 _SAME_ALIAS = 0.01  # periods per frame; tones are separated from 0.02 on in a window of 96 frames
+# rad, of the phase of a tone from a frame to the next one: with every seventh frame missing, 93.0 and 121.0 Hz were
+# stated as 93.47 and 121.15 Hz and jumped by 0.37 and 0.22 rad
+_MAX_JUMP = 0.1
 _MAX_APART = 0.25  # of a tone, left in a third of the rows or columns: up to 0.14 of tones of cameras, at night
 # Of the usual change from frame to frame: at least 0.18 in 36 clips that a hand holds, and at most 0.12 of copies in a
 # video of 24 frames per second that is stored as 30. More frames in a row are no copies: a pan has ended, or it is dark
@@ -316,6 +320,7 @@ class VideoPasses:
             )
             if value > allowed
         ]
+        against += exposure_reasons(self.frames.job.timing.in_row_order(), *window.blur)
         if window.other_readout is not None:
             name, stated, other = window.other_readout
             against.append(Reason("readout_contradicted", None, stated, other, {"other": name}))
@@ -382,19 +387,27 @@ class VideoPasses:
             and (cycles := abs(first.frequency - second.frequency) * timing.frame_period) > 0.5
             and abs(cycles - round(cycles)) < _SAME_ALIAS
         ]
+        # Where frames are missing, the phase of a tone jumps, and others of 0.1 to 0.2 px seem to be beside it: 0.75 to
+        # 0.8 of the tone are not followed, of one that is switched on and off 0.6, at most 0.21 in 14 clips. Tones of
+        # the other axis are wrong as well then.
+        largest = {tone.axis: tone for tone in sorted(window.tones, key=lambda tone: tone.size)}
+
+        def changed(tone: WindowTone, change: float, allowed: float) -> Reason:
+            limit, details = allowed * tone.size, {"frequency": tone.frequency}
+            return Reason("tone_changes", AXIS_NAMES[tone.axis], change, limit, details)
+
+        jumps = [changed(tone, tone.jump * tone.size, _MAX_JUMP) for tone in largest.values() if tone.jump > _MAX_JUMP]
         findings = []
         for axis, name in enumerate(AXIS_NAMES[:2]):
             of_axis = [tone for tone in tones if tone.axis == axis]
-            of_window = [tone for tone in window.tones if tone.axis == axis]
-            apart = max((tone.apart for tone in of_window), default=0.0)
+            apart = max((tone.apart for tone in window.tones if tone.axis == axis), default=0.0)
             known = any(abs(tone.coefficient) > SIGNIFICANT * tone.amplitude_std for tone in of_axis)
             against = aliases[:1] if known else [Reason("no_tone", name)]
-            # Where frames are missing, the phase of a tone jumps, and others of 0.1 to 0.2 px seem to be beside it:
-            # 0.75 to 0.8 of the tone are not followed, of one that is switched on and off 0.6, at most 0.21 in 14 clips
-            largest = max(of_window, key=lambda tone: tone.size, default=None)
-            if largest is not None and largest.bend() > (limit := largest.size / SIGNIFICANT):
-                frequency = {"frequency": largest.frequency}
-                against = [Reason("tone_changes", name, largest.bend(), limit, frequency), *aliases[:1]]
+            if axis in largest:
+                one = largest[axis]
+                bends = [changed(one, one.bend(), 1 / SIGNIFICANT)] if one.bend() > one.size / SIGNIFICANT else []
+                if jumps or bends:
+                    against = [*(jumps[:1] or bends), *aliases[:1]]
             if apart > _MAX_APART:
                 against.append(Reason("rows_differ", name, apart, _MAX_APART))
             fastest = max((tone.frequency for tone in of_axis), default=0.0)
@@ -420,7 +433,7 @@ class _FirstPass:
         self._before: tuple[int, NDArray[np.uint8]] | None = None  # the usable frame before, and its number
         self._changes: deque[float] = deque(maxlen=_MEMORY)  # counts, of the frames before
         self._waiting: list[tuple[int, NDArray[np.uint8], float]] = []  # possible copies of it, and their changes
-        self._follower = CornerFollower(self._timing)
+        self._follower = CornerFollower(self._timing, compare_blur=video.rates is None and not video.stabilised)
 
     @property
     def cuts(self) -> list[int]:

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+from dataclasses import replace
 
 import av
 import numpy as np
@@ -19,6 +20,7 @@ from rsvib_torch.video import process_video
 
 HEIGHT, WIDTH, COUNT, RATE = 168, 144, 40, 30.0
 TIMING = SensorTiming(row_time=150e-6, exposure_rows=4, frame_rows=1 / RATE / 150e-6)
+LONG = replace(TIMING, exposure_rows=20)
 CAMERA = ("--row-time", "150us", "--exposure", "0.6ms", "--frame-rate", "30")
 VIBRATION = Motion((2.1, 1.6), (52.0, 71.0), (0.5, 1.0))
 TIMES = np.arange(COUNT) / RATE
@@ -51,8 +53,13 @@ def counts_of(motion, count=COUNT, scene=SCENE):
     return np.clip(np.round(255 * np.stack(taken, -1)), 0, 255).astype(np.uint8)
 
 
-def write(path, frames, times=TIMES, **options):
-    return write_sharp(path, frames, times[: len(frames)], **options)
+def grey_counts_of(timing, motion, count):
+    taken = take_frames(SCENE[0], timing, motion, count, 0.004, seed=3)
+    return np.clip(np.round(255 * np.repeat(taken[..., None], 3, -1)), 0, 255).astype(np.uint8)
+
+
+def write(path, frames, times=None, **options):
+    return write_sharp(path, frames, np.arange(len(frames)) / RATE if times is None else times, **options)
 
 
 @pytest.fixture(scope="module", name="frames")
@@ -63,6 +70,11 @@ def make_frames():
 @pytest.fixture(scope="module", name="clip")
 def make_clip(frames, tmp_path_factory):
     return write(tmp_path_factory.mktemp("video") / "clip.mp4", frames, sound="aac")
+
+
+@pytest.fixture(scope="module", name="blurred")
+def make_blurred(tmp_path_factory):
+    return write(tmp_path_factory.mktemp("video") / "blurred.mp4", grey_counts_of(LONG, VIBRATION, 20))
 
 
 @pytest.fixture(scope="module", name="shaky")
@@ -240,6 +252,27 @@ def test_tones_of_a_video_whose_frames_are_missing_without_a_gap_in_its_times_ar
     found = read_manifest(report.manifest).detections()
     assert not any(bool(one.reliable.any()) for one in found)
     assert "tone_changes" in {reason.code for one in found for of_axis in one.findings for reason in of_axis}
+
+
+def test_tones_whose_phase_jumps_at_missing_frames_are_not_reliable(tmp_path):
+    """With every seventh frame missing, 93 and 121 Hz were stated as 93.44 and 121.16 Hz, without other changes."""
+    kept = [number for number in range(46) if number % 7 != 3]
+    frames = grey_counts_of(TIMING, Motion((1.2, 0.8), (93.0, 121.0), (0.5, 1.0)), 46)[kept]
+    report = process_video(write(tmp_path / "clip.mp4", frames), tmp_path / "still.mp4", TIMING, **OPTIONS)
+    for found in read_manifest(report.manifest).detections():
+        assert [of_axis[0].code for of_axis in found.findings] == ["tone_changes"] * 2
+
+
+@pytest.mark.parametrize("stated", [0.3, 1.0])
+def test_a_stated_exposure_that_is_too_short_for_the_blur_is_refused(blurred, tmp_path, stated):
+    """An exposure of 3 ms, stated as 0.9 ms: amplitudes are 3 to 6 % too small, and nothing else shows it."""
+    timing = replace(LONG, exposure_rows=stated * LONG.exposure_rows)
+    report = process_video(blurred, tmp_path / "still.mp4", timing, **OPTIONS)
+    (found,) = read_manifest(report.manifest).detections()
+    codes = [[reason.code for reason in of_axis] for of_axis in found.findings]
+    assert codes == ([["blur_contradicts_exposure"]] * 2 if stated < 1 else [[], []])
+    if stated < 1:
+        assert 1.8 < found.findings[0][0].details["likely_ms"] < 3.6
 
 
 def test_copies_of_frames_are_moved_along_the_smooth_path(tmp_path):
