@@ -239,7 +239,7 @@ def test_long_operations_report_their_progress(place, tmp_path):
         restored, found = units(lambda m=method: rsv.restore(frames, TIMING, detection, method=m, check=False))
         assert unit in found
     _, found = units(lambda: rsv.judge_restoration(frames, restored, TIMING, detection))
-    assert found == {"stacks"}
+    assert found == {"pairs of frames"}
     _, found = units(lambda: rsv.write_stack(tmp_path / "r.npy", restored))
     assert found == {"frames"}
 

@@ -65,7 +65,7 @@ def test_a_stack_that_does_not_fit_is_refused_by_every_command(tmp_path, set_fre
         ("run", stack, out),
         ("detect", stack, "--out", out),
         ("motion", stack, "--out", tmp_path / "motion-out.csv"),
-        ("restore", stack, f"{out}.tif", "--motion", tmp_path / "motion.csv", "--unit", "px"),
+        ("restore", stack, f"{out}.tif", "--motion", tmp_path / "motion.csv", "--unit", "px", "--offset", 0),
     ):
         error = refused(capsys, *arguments, *camera)
         assert re.search(r"memory.*(takes about|need) [0-9.]+ GB|need [0-9.]+ GB of memory", error), error
