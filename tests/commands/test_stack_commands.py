@@ -91,7 +91,7 @@ def test_a_required_axis_that_is_not_reliable_is_exit_code_3(place, tmp_path, ca
     assert "--require-reliable: y not reliable" in shown.err
     assert "Files" in shown.out
     assert rsvib(*found, "--require-reliable", "x,roll") == 3
-    motion = ("motion", tmp_path / "noise.tif[4:8]", *options, "--search", 6)
+    motion = ("motion", tmp_path / "noise.tif[2:7]", *options, "--search", 6)
     assert rsvib(*motion, "--out", tmp_path / "motion.csv", "--require-reliable", "x") == 3
     assert "expected axes such as x,y" in refused(capsys, *found, "--require-reliable", "z")
 
