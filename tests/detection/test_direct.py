@@ -389,3 +389,19 @@ def test_frames_that_are_compared_at_a_wrong_place_are_not_reliable(number):
     for axis, tones in enumerate(taken.case.tones):
         amplitude = float(found.vibration.amplitude[axis, 0])
         assert not bool(found.reliable[axis]) or amplitude == pytest.approx(tones[0, 0], rel=0.02)
+
+
+@pytest.mark.parametrize("number", [7101, 7104])
+def test_tones_that_differ_by_less_than_a_period_within_the_record_are_resolved(number):
+    """Two tones 3 Hz apart in four frames, half a period: one of them with the rest of the other is refused."""
+    taken = recording("close pair, 3 Hz apart", number, 224)
+    found = detect_vibration(torch.from_numpy(taken.frames).float(), taken.timing)
+    assert found.reliable.all(), found.reasons
+    for axis, tones in enumerate(taken.case.tones):
+        order = found.vibration.frequency[axis, :2].argsort()
+        for values, std, true in (
+            (found.vibration.frequency, found.std.frequency, tones[:, 1]),
+            (found.vibration.amplitude, found.std.amplitude, tones[:, 0]),
+        ):
+            error = (values[axis, :2][order].numpy() - true[tones[:, 1].argsort()]) / std[axis, :2][order].numpy()
+            assert np.abs(error).max() < 4

@@ -254,10 +254,15 @@ def _disturbed(measurements: Measurements, residual: Array) -> Array:
     return ~np.all(most < 0.05 * whole, -1)
 
 
+# of 1 / duration. 80 recordings of two tones on each axis, 0.2 to 0.9 apart: 73 of 160 axes are reliable, the rms of z
+# of their parameters is 0.96. With 0.7 20, with 0 93 axes, of which one is wrong by 1 %, 7 standard deviations
+_RESOLUTION = 0.35
+
+
 def _resolved(measurements: Measurements, fit: ToneFit) -> Array:
-    """(B, 2) bool: all tones of an axis are at least 0.7 of 1 / duration apart; closer ones fit one tone and noise."""
+    """(B, 2) bool: the tones of an axis are further apart than the resolution; closer ones fit one tone and noise."""
     order = np.sort(np.where(fit.active, fit.frequencies, np.nan), -1)
-    return ~((order[..., 1:] - order[..., :-1]) * measurements.span[:, None, None] < 0.7).any(-1)
+    return ~((order[..., 1:] - order[..., :-1]) * measurements.span[:, None, None] < _RESOLUTION).any(-1)
 
 
 def _with_blind_tones(measurements: Measurements, weighted: Measurements, fit: ToneFit, blind: Array) -> ToneFit:
