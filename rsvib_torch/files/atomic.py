@@ -232,9 +232,11 @@ def check_outputs(outputs: Iterable[_Path], inputs: Iterable[_Path], *, folder: 
         places = [(f"cannot write {output}", output, "name") for output in outputs]
         if folder is not None and (os.path.isdir(source) or not _inside(source, folder)):
             places.insert(0, (f"cannot write into {folder}", folder, "folder"))
-        members = [Path(place, name) for place, _, names in os.walk(source) for name in names]
         for problem, place, remedy in places:
-            relation, member = _relation(place, source), next((one for one in members if _same_file(one, place)), None)
+            relation, member = _relation(place, source), None
+            if not relation and os.path.isfile(place):  # others are no file of a folder, which may have many
+                members = (Path(above, name) for above, _, names in os.walk(source) for name in names)
+                member = next((one for one in members if _same_file(one, place)), None)
             if relation or member:
                 found = f"{relation} the input {source}" if relation else f"is the same file as {member} of the input"
                 raise ValueError(f"{problem}: it {found}; choose another {remedy}")
