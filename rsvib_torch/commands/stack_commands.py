@@ -124,8 +124,8 @@ class RestoreOptions(shared.RestorationCommand):
     offset: float | None = option(None, show_default="for a gyroscope, estimated from the frames")
     """Required with --unit: time of the recording, in s, at the exposure start of the first row of frame 0."""
     ignore: list[str] | None = option(None, metavar="ROWS[,COLUMNS]", show_default="all rows count")
-    """Rows of the frames, or a part of them, that do not count in the comparison with the recording, for example 400:
-    for a dashboard below row 400, or :60,500: for a sign in a corner; may be given several times."""
+    """With a gyroscope: rows of the frames, or a part of them, that do not count in the comparison with it, for example
+    400: for a dashboard below row 400, or :60,500: for a sign in a corner; may be given several times."""
     processing: Annotated[
         Table,
         Given(
@@ -150,8 +150,8 @@ def restore(given: RestoreOptions) -> Answer:
     """Restore a stack of frames with a detected vibration or a recorded motion.
 
     The offset of a recorded motion is stated (--offset); that of a gyroscope is found by the frames: rates that do not
-    explain them are refused. If the restored frames are judged no
-    better than the input, the input is written unchanged. --force restores in both cases.
+    explain them are refused. If the restored frames are judged no better than the input, the input is written
+    unchanged. --force restores in both cases.
     """
     settings, frames, vibration = given.settings, given.frames, given.vibration
     outputs = [*io.stack_files(given.restored), given.manifest]
@@ -213,8 +213,9 @@ def _motion_of_frames(given: RestoreOptions, path: Path, info: StackInfo, answer
 def _recorded(given: RestoreOptions, path: Path) -> rsvib_torch.FreeMotion | rsvib_torch.AngularRates:
     """The motion of a CSV file, or the rates of a gyroscope."""
     if given.unit is not None:
-        if given.lens_profile is not None:
-            raise ValueError("--lens-profile is for a gyroscope, without --unit")
+        if given.lens_profile is not None or given.ignore:
+            name = "--ignore" if given.lens_profile is None else "--lens-profile"
+            raise ValueError(f"{name} is for a gyroscope, without --unit")
         return rsvib_torch.read_motion(path, unit=given.unit, focal_length=given.focal_length)
     if given.offset is not None:
         raise ValueError("--offset needs --unit; axes and clock of a gyroscope are estimated from the frames")

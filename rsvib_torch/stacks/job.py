@@ -283,8 +283,10 @@ def _given(
     starts: list[float] = (timing.frame_starts(info.shape[0]) - timing.frame_starts(1)).tolist()
     readout = info.shape[int(timing.scan_axis)] * timing.row_time + timing.exposure_time
     if motion.start > motion.spacing or motion.end < starts[-1] + readout - motion.spacing:
-        needed = f"the frames need 0 to {starts[-1] + readout:.6g} s"
-        raise ValueError(f"motion covers {motion.start:.6g} to {motion.end:.6g} s on the clock of the frames, {needed}")
+        raise ValueError(
+            f"motion covers {motion.start:.6g} to {motion.end:.6g} s on the clock of the frames, the frames need 0 to "
+            f"{starts[-1] + readout:.6g} s; check its offset, motion.retimed(offset) (commands: --offset)"
+        )
     ends = [(starts[window.first], starts[window.last]) for window in windows]
     parts = [motion.within(first - readout, last + 2 * readout).retimed(first) for first, last in ends]
     return [part.to(options.device) for part in parts]
