@@ -142,6 +142,8 @@ def _packets(path: Path) -> list[_Packet]:
                         _Packet(start, duration, [_stream(content) for content in _contents(device, b"STRM")])
                         for device in _contents(data, b"DEVC")
                     ]
+                    if not devices:
+                        raise ValueError(f"GPMF packet {len(packets)} has no device (DEVC)")
                     packets.append(next((device for device in devices if device.gyroscope is not None), devices[0]))
                 if packets:
                     return packets

@@ -110,7 +110,7 @@ def _frame_files(path: Path) -> list[Path]:
     if len(found) > 1:
         raise ValueError(f"{path}: the folder contains both {' and '.join(found)} files; expected one kind")
     if not found:
-        raise ValueError(f"{path}: the folder contains no PNG, TIFF or JPEG files; of a Zarr store, write HDF5")
+        raise ValueError(f"{path}: the folder contains no PNG, TIFF or JPEG files; convert a Zarr store to HDF5")
 
     def parts(file: Path) -> list[tuple[int, int, str]]:
         split = re.split(r"(\d+)", file.name)
