@@ -32,7 +32,12 @@ def nearest_folder(path: Path) -> Path:
 
 def sync(path: Path) -> None:
     """Return when the content of a file, or the names in a folder, are on the disk: a power loss does not undo them."""
-    file = os.open(path, os.O_RDONLY)
+    try:
+        file = os.open(path, os.O_RDONLY)
+    except PermissionError:
+        if path.is_dir():  # a folder in which files may be created but not listed
+            return
+        raise
     try:
         os.fsync(file)
     except OSError as error:
