@@ -51,6 +51,7 @@ _STRIP = 160  # px, width of the strip of columns that is judged with roll or zo
 _MIN_NOISE = 1e-5  # of full scale; noise level assumed at least, rounding of float32 images
 _SMOOTHING = 5.0  # px, standard deviation of the Gaussian in ``misfit``; displacements of up to about 10 px stay linear
 _RIM = math.ceil(3 * _SMOOTHING) + 1  # px; half width of the kernels of ``misfit``
+_NEAR = 8  # px around missing pixels within which the restored frame is a guess
 _MARGIN = 4  # px between the compared pixels and those outside the frame
 
 
@@ -346,18 +347,21 @@ def _cut_pairs(given: _JudgedFrames, common: _CommonParts, detailed: list[slice]
     predicted, formed_later = reblur(both, given.motion, common.stack, later, second[:, 0]).unbind(1)
     # 3. Predicted values at missing pixels, and the part that is compared.
     inner = (..., slice(rim_y, height - rim_y), slice(rim_x, width - rim_x))
-    missing = None
+    missing, compared_later = None, still_later
     if given.missing is not None:
         missing = torch.stack([cut(given.missing, earlier, first), cut(given.missing, later, second)], 1)
         of_earlier = reblur(still[:, None], given.motion, common.stack, earlier, first[:, 0])[:, 0]
         raw = torch.where(missing[:, 0], of_earlier, raw)
-        raw_later = torch.where(missing[:, 1], predicted, raw_later)
+        # what was restored near missing pixels of the earlier frame is a guess, which the later frame does not confirm
+        near = functional.max_pool2d(missing[:, 0].to(raw.dtype), 2 * _NEAR + 1, 1, _NEAR) > 0
+        raw_later = torch.where(missing[:, 1] | (near & (not single)), predicted, raw_later)
+        compared_later = torch.where(near, still, still_later)
         missing = missing[inner]
     return FramePairs(
         raw[inner],
         raw_later[inner],
         still[inner],
-        None if single else still_later[inner],
+        None if single else compared_later[inner],
         predicted[inner],
         (formed_later - still_later)[inner],
         missing,

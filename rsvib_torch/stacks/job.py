@@ -188,7 +188,7 @@ class StackJob:
         with suppress(ValueError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
             found = detect_motion(taken, timing, knot_rows=min(24, max(4, rows // _KNOTS)))
             if found.reliable.sum() > detected.reliable.sum():
-                return found, equivalent_tones(found)
+                return found, equivalent_tones(found, detected)
         return detected, detected
 
     def _images(self, frames: Sequence[Array]) -> Tensor:

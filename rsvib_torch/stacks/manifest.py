@@ -186,10 +186,16 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
             return [table, spread]
         which = "all" if changing == count else f"{changing} of {count}"
         text = f"no steady tones explain {which} windows, whose motion was therefore measured without tones"
+        refused: dict[object, str] = {
+            record.window: "; ".join(map(str, record.detection.assumptions))
+            for record in self.windows
+            if record.detection is not None and record.motion is not None and record.detection.assumptions
+        }
         return [
             table,
             f"amplitude: in the first and the last window; frequency: {spread}",
             wrapped(f"{text}; amplitudes are those of a tone of the same rms displacement"),
+            *(wrapped(f"assumed in {text}") for text in _first_of(refused)),
         ]
 
     def _lines_of_video(self) -> list[str]:

@@ -133,12 +133,21 @@ def may_change(detection: DetectedVibration, num_frames: int) -> bool:
     return num_frames >= _LEAST_FRAMES and not is_other_timing and not _CHANGES.isdisjoint(codes)
 
 
-def equivalent_tones(found: MotionDetection) -> DetectedVibration:
-    """``tones_in_place_of`` a detected motion."""
+def equivalent_tones(found: MotionDetection, detection: DetectedVibration) -> DetectedVibration:
+    """``tones_in_place_of`` a detected motion, with the reasons against the tones of the ``detection`` as assumptions.
+
+    A wrong timing and lost frames have the same reasons as a vibration that changes.
+    """
+    against = zip(AXIS_NAMES, detection.findings, strict=False)
+    refused = tuple(
+        f"the vibration changes; tones along {name} are refused: {one}" for name, of in against for one in of
+    )
     first, last = float(found.times.min()), float(found.times.max())
     std, interval = found.std.square().mean((0, 1)).sqrt(), float(found.times[:, 0].diff().mean())
     tones = tones_in_place_of(found.motion, first, last, std, interval)
-    return replace(tones, residual=found.unexplained, reliable=found.reliable, findings=found.findings)
+    return replace(
+        tones, residual=found.unexplained, reliable=found.reliable, findings=found.findings, assumptions=refused
+    )
 
 
 def tones_of_given(motion: FreeMotion, timing: SensorTiming, num_frames: int, rows: int) -> DetectedVibration:

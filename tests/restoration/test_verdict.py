@@ -12,7 +12,7 @@ from field_truth import FieldMotion, take_field_frames
 from refusals import without_warning
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
-from rsvib_torch import SensorTiming, Vibration
+from rsvib_torch import SensorTiming, Vibration, simulate_frames
 from rsvib_torch.datasets import city_and_fields
 from rsvib_torch.restoration import RestorationWarning, judge_restoration, restore
 from rsvib_torch.restoration.judge import pairs_to_judge
@@ -364,3 +364,17 @@ def test_pairs_of_frames_with_roll_are_judged_at_their_times():
     restored = restore(frames, timing, vibration, joint=True, check=False)
     verdict = judge_restoration(frames, restored, timing, vibration, joint=True, most_pairs=2)
     assert verdict.outcome == ("helps", "helps")
+
+
+@pytest.mark.parametrize("frame", [1, 3])
+def test_missing_pixels_do_not_make_a_right_motion_wrong(frame):
+    """What is restored in the place of missing pixels of one frame is no prediction of the next one."""
+    timing = SensorTiming(row_time=50e-6, exposure_rows=20, frame_rows=300)
+    right = Vibration([[2.1], [1.6]], [[110.0], [90.0]], [[0.5], [1.0]])
+    frames = simulate_frames(city_and_fields(300, 300, seed=0), timing, right, num_frames=4, frame_size=(240, 230))
+    frames = frames + 0.004 * torch.randn(frames.shape, generator=torch.Generator().manual_seed(0))
+    frames[frame, 80:140, 60:160] = torch.nan
+    wrong = Vibration(0.5 * right.amplitude, right.frequency, right.phase)
+    for motion, outcome in ((right, "helps"), (wrong, "partly")):
+        restored = restore(frames, timing, motion, check=False)
+        assert set(judge_restoration(frames, restored, timing, motion).outcome) == {outcome}

@@ -60,6 +60,8 @@ def test_windows_state_equivalent_tones_and_their_motion(place):
     table = manifest.table()
     assert all(table["reliable"])
     assert all(table["equivalent"])
+    assert all("tones along" in str(one) for record in manifest.windows for one in record.detection.assumptions)
+    assert "the vibration changes; tones along x are refused: " in " ".join(manifest.summary().split())
     envelope = np.exp(-np.array(table["middle_time_s"]) / DECAY)
     windows = len(manifest.windows)
     np.testing.assert_allclose(table["amplitude_px"], np.tile(AMPLITUDE, windows) * envelope, rtol=0.1)
