@@ -163,6 +163,10 @@ def restore(given: RestoreOptions) -> Answer:
     of_run = given.of_stack | {"force": given.force} | given.processing
     # 1. The vibration of all frames, or the motion on the clock of the frames.
     if vibration is not None and given.motion is None:
+        of_recordings = ("offset", "unit", "ignore", "focal_length", "lens_profile")
+        if useless := [name for name in of_recordings if getattr(given, name) not in (None, ())]:
+            option = useless[0].replace("_", "-")
+            raise ValueError(f"--{option} is for --motion, a recording; --vibration is that of the frames themselves")
         detected = reports.read_vibration(vibration, io.timing_from_first_frame(settings.timing, info))
         stacks.check_stack_fits(info, chosen, on_gpu=given.torch_device.type != "cpu")
         print_notes(info, settings)

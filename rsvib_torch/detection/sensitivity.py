@@ -249,13 +249,12 @@ def _exposure_range(tones: _Tones, timing: RowTiming, ratio: float, std: float) 
     """
     stated = timing.exposure_time
     low, high = (min(stated * math.sqrt(max(ratio + 2 * n * std, 0.0)), timing.frame_period) for n in (-1, 1))
-    low, high = min(low, stated), max(high, stated)
     of_tones = []
     for axis, _, frequency in (tone for tone in tones if tone[0] < 2):
         # an exposure of a period averages the tone out; a fit without meaning may have a frequency of 0
         longest = min(high, 0.9 / frequency) if frequency else high
         changes = [100 * (np.sinc(frequency * stated) / np.sinc(frequency * time) - 1) for time in (low, longest)]
-        if stated < longest and max(map(abs, changes)) > 1.0:
+        if low < longest and frequency * stated < 0.9 and max(map(abs, changes)) > 1.0:
             more = " and more" if longest < high else ""
             name = f"{AXIS_NAMES[axis]} {frequency:.4g} Hz"
             # the phase is measured in the middle of the exposure, and stated for its start

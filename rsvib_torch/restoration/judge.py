@@ -205,8 +205,13 @@ def judge_stacks(
         apart = [number for number in of_stack if number not in judged]
         if apart:
             (earlier, later), (down, right) = common.frames[apart[0]], common.step[apart[0]]
-            common_text = f"frames {earlier} and {later} have nothing in common, or too little: "
-            verdicts.append(TooLittleInCommonError(f"{common_text}they lie ({right}, {down}) px apart"))
+            height, width = given.images.shape[-2:]
+            verdicts.append(
+                TooLittleInCommonError(
+                    f"frames {earlier} and {later} have nothing in common, or too little: they lie ({right}, {down}) "
+                    f"px apart, in frames of {width} x {height} px whose rows move"
+                )
+            )
             continue
         levels, displacements, outcomes, reasons = zip(*(judged[number] for number in of_stack), strict=True)
         moved = torch.from_numpy(np.stack(displacements, 1)).to(raw.device)  # (3, P, 2)

@@ -48,6 +48,10 @@ def test_mistakes_of_a_value_name_its_sources(place, tmp_path, capsys):
         (("detect", "--config", "{}", "--out", "d", "--full-scale", 0), "--full-scale must be larger than 0"),
         (("motion", "--config", "{}", "--out", "m.csv", "--knot-rows", 1), "--knot-rows must be at least 4"),
         (
+            ("restore", "o.tif", "--config", "{}", "--vibration", "{}", "--focal-length", 900),
+            "--focal-length is for --motion, a recording",
+        ),
+        (
             ("run", "r", "--config", "{}", "--method", "exact", "--joint", 4),
             "--joint must be at most 3, the number of frames",
         ),
