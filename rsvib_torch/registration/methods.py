@@ -320,9 +320,8 @@ def register_projection(task: BandTask) -> tuple[Tensor, Tensor]:
     """
     _, shift, valid = _search(task)
     down, along = (_profile_correlation(task, shift, reach) for reach in ((LAGS, 0), (0, LAGS)))
-    valid &= _inside(task, shift) & (
-        torch.minimum(down.amax(-1), along.amax(-1)) > 0.6
-    )  # profiles of a few dozen rows reach 0.6 by chance
+    # profiles of a few dozen rows reach 0.6 by chance
+    valid &= _inside(task, shift) & (torch.minimum(down.amax(-1), along.amax(-1)) > 0.6)
     return fine_offsets(task, shift, 0.5 * (down[..., :, None] + along[..., None, :]), valid)
 
 

@@ -321,7 +321,7 @@ def plan_job(
     check_optics(job.chosen.optics)
     joint, most = job.chosen.joint, min(stated.window, info.shape[0])
     if joint is not True and joint > most:
-        raise ValueError(f"joint must be at most {most}, the number of frames in a window (window), got {joint}")
+        raise ValueError(f"joint must be at most {most}, the number of frames of a window, got {joint}")
     if options.workers is not None:
         most = options.workers
     elif on_gpu:

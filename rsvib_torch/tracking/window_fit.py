@@ -45,9 +45,8 @@ _NEARLY_BLIND, _MAX_APART = 0.5, 0.1
 # 40 clips, 0.23 in nearly dark ones
 _MOST_APART = 0.5
 SIGNIFICANT = 3.0  # standard deviations of a tone
-_CERTAIN = (
-    10.0  # standard deviations of a jump of its phase: at most 10 of 76 tones in H.264, 23 to 58 beside missing frames
-)
+# standard deviations of a jump of its phase: at most 10 of 76 tones in H.264, 23 to 58 beside missing frames
+_CERTAIN = 10.0
 _MIN_SHARE = 2e-3  # of the largest variance that a tone of 1 px causes; others are hidden by the path
 _MIN_SINC = 0.1  # of the amplitude that remains in the mean over the exposure
 # rows of the patch of a corner, over which its displacement is a mean: amplitudes of 52 to 205 Hz are then right within
