@@ -308,7 +308,7 @@ class OtherMotion:
             unexplained=np.maximum(measurements.unexplained(residual), measurements.of_worst_group(residual)),
             correlated=measurements.correlated(residual),
             differential=differential,
-            measured=np.where(seen > 0, registered / np.maximum(seen, 1), 1.0).min(1),
+            measured=(np.where(seen > 0, registered / np.maximum(seen, 1), 1.0) * seen.any(1, keepdims=True)).min(1),
             blur=np.broadcast_to(np.array([1.0, 0.0, 0.0]), (len(residual), 3)),
         )
 
