@@ -296,6 +296,11 @@ _TONES = {
         compares="the stated row time (value), and the one with which detection is reliable (limit)",
         unit="s",
     ),
+    "other_frame_times": _of_all_axes(
+        "the frames agree with a lost frame between frames {before} and {after}",
+        "state frame_start_times that are a frame period later from frame {after} on, or detect in the frames before "
+        "or after the lost one",
+    ),
     "other_readout_direction": _of_all_axes(
         "the frames agree with readout_direction='{agreeing}', not with '{stated}'"
     ),

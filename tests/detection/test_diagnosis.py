@@ -97,6 +97,15 @@ def test_a_wrong_readout_is_named(frames, wrong, code, agreeing):
     assert (cause.code, cause.details["agreeing"]) == (code, agreeing)
 
 
+@pytest.mark.parametrize("lost", [1, 3])
+def test_a_lost_frame_is_named(lost):
+    recorded_frames = recorded((HEIGHT, WIDTH), TIMING, MOTION, 6, 0.005, seed=8)
+    found = detect_vibration(torch.cat([recorded_frames[:lost], recorded_frames[lost + 1 :]]), TIMING)
+    assert not found.reliable.any()
+    (cause,) = causes(found)
+    assert (cause.code, cause.details) == ("other_frame_times", {"before": lost - 1, "after": lost})
+
+
 def test_a_motion_that_is_no_sum_of_tones_names_no_timing():
     found = detect_vibration(recorded((HEIGHT, WIDTH), TIMING, walk, 4, 0.005, seed=8), TIMING)
     codes = {reason.code for of_axis in found.findings for reason in of_axis}

@@ -354,8 +354,8 @@ def fitted_again(measurements: Measurements, fit: ToneFit) -> ToneFit:
     return select_stacks(is_bounded(exact, measurements.exposure_time), exact, fit)
 
 
-# px, motion during an exposure; px and px/s, amplitude and drift; Hz. Fits beyond diverge: frames are smaller. A path of
-# 700 px in each of four frames of 400 px took 120 s
+# px, motion during an exposure; px and px/s, amplitude and drift; Hz. Fits beyond diverge: frames are smaller. A path
+# of 700 px in each of four frames of 400 px took 120 s
 _MAX_PATH, _MAX_SIZE, _MAX_FREQUENCY = 300.0, 1e6, 1e9
 
 
