@@ -349,7 +349,7 @@ class DetectStackOptions(StackDetectionOptions, ProgressOptions):
 
 
 @options
-class RunOptions(ProgressOptions):
+class FileRunOptions(ProgressOptions):
     """A run from file to file."""
 
     resume: bool = False
@@ -359,7 +359,7 @@ class RunOptions(ProgressOptions):
 
 
 @options
-class ProcessStackOptions(RunOptions, StackOptions):
+class ProcessStackOptions(FileRunOptions, StackOptions):
     """Options of ``process_stack``."""
 
     given: Detections = None
@@ -372,7 +372,7 @@ class ProcessStackOptions(RunOptions, StackOptions):
 
 
 @options
-class ProcessVideoOptions(RunOptions, ResourceOptions):
+class ProcessVideoOptions(FileRunOptions, ResourceOptions):
     """Options of ``process_video``; each of its two passes counts as half of the progress."""
 
     border: BorderName = "mirror"

@@ -18,26 +18,25 @@ import shutil
 import stat
 import time
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack, closing, suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import IO, Literal
+from typing import IO, Any, Literal
 
 import numpy as np
 
-from rsvib_torch.checks.arguments import check_fields
+from rsvib_torch.checks.arguments import PathLike, check_fields
 from rsvib_torch.files import atomic
 from rsvib_torch.files.atomic import check_outputs, nearest_folder, sync
 from rsvib_torch.files.reading import Table, size_text
 from rsvib_torch.io.stack_writing import stack_files
 from rsvib_torch.numerics.tables import Array
-from rsvib_torch.options import RunOptions
+from rsvib_torch.options import FileRunOptions
 from rsvib_torch.results.presentation import Summarised, decode, plain_values
-from rsvib_torch.stacks.job import WindowResult
 from rsvib_torch.stacks.manifest import StackManifest, read_manifest
-from rsvib_torch.stacks.windows import WindowRecord
+from rsvib_torch.stacks.windows import WindowRecord, WindowResult
 from rsvib_torch.text import number_of, one_line
 
 _SETTINGS = "settings.json"
@@ -216,6 +215,12 @@ class RunFolder:
         """Names of the files of the finished windows in order."""
         return [name for window in sorted(self._finished) for name in self._finished[window][1]]
 
+    def frames(self) -> Iterator[Array]:
+        """Frames of the finished windows in order, from the files of arrays."""
+        for name in self.files():
+            with self.open(name) as file:
+                yield from np.load(file, allow_pickle=False)
+
     def remove(self) -> None:
         """Remove the folder, and the empty folders above it that were created for it.
 
@@ -292,26 +297,55 @@ class StackReport(Summarised):
         return "\n".join(lines)
 
 
-def run_to_file(
-    sink: Path,
-    options: RunOptions,
-    header: Table,
-    *,
-    inputs: Iterable[Path],
-    compute: Callable[[RunFolder], Table],
-    write: Callable[[RunFolder], None],
-) -> StackReport:
-    """Compute the windows of a run that are not finished, and write the output and its manifest; neither is an input.
+class FileRun:
+    """A run that writes an output and its manifest; neither is an input.
 
-    ``compute`` adds the missing windows to the folder and returns further fields of the manifest; ``write`` writes the
-    output from the folder.
+    Its steps are ``complete``, ``folder``, ``writing`` and ``report``.
     """
-    start = time.perf_counter()
-    header = json.loads(json.dumps(header))  # lists instead of tuples, as in files
-    path = sink.with_name(f"{sink.name}.manifest.json") if options.manifest is None else Path(options.manifest)
-    check_outputs([*stack_files(sink), work_folder(sink), path], inputs)
 
-    def report(manifest: StackManifest, resumed: int) -> StackReport:
+    def __init__(self, sink: Path, manifest: PathLike | None, header: Table, inputs: Iterable[Path]) -> None:
+        self._start = time.perf_counter()
+        self.sink, self.header = sink, json.loads(json.dumps(header))  # lists instead of tuples, as in files
+        self.manifest = sink.with_name(f"{sink.name}.manifest.json") if manifest is None else Path(manifest)
+        check_outputs([*stack_files(sink), work_folder(sink), self.manifest], inputs)
+
+    def complete(self) -> StackManifest | None:
+        """The manifest of the output if it is complete; an error if it is that of a run with other settings."""
+        if work_folder(self.sink).exists() or not (self.sink.exists() and self.manifest.exists()):
+            return None
+        manifest = read_manifest(self.manifest)
+        difference = _difference({name: getattr(manifest, name) for name in self.header}, self.header)
+        if difference:
+            raise ValueError(
+                f"{self.sink}: cannot resume: {difference}; resume with the settings of before, or write another output"
+            )
+        for written in (self.sink, self.manifest):
+            atomic.remove_abandoned(written)
+        return manifest
+
+    @contextmanager
+    def folder(self, *, resume: bool) -> Iterator[RunFolder]:
+        """The folder of the finished windows, which errors of a full disk in the block state."""
+        opened = closing(RunFolder(self.sink, self.header, resume=resume))
+        with opened as folder, atomic.full_disk_named(self.sink, folder.kept):
+            yield folder
+
+    @contextmanager
+    def writing(self, folder: RunFolder, **stated: Any) -> Iterator[StackManifest]:
+        """Write the manifest, which ``stated`` fields belong to, after the block, which writes the output.
+
+        The folder is removed when both are on the disk.
+        """
+        atomic.make_folder(self.manifest.parent)
+        manifest = StackManifest(**self.header, **stated, windows=tuple(folder.records()))
+        with atomic.whole_file(self.manifest) as part:
+            manifest.save(part)
+            yield manifest
+        sync(self.manifest.absolute().parent)  # the temporary folder is gone as well
+        folder.remove()
+
+    def report(self, manifest: StackManifest, resumed: int, first: WindowResult | None = None) -> StackReport:
+        """The summary of the run, of which ``resumed`` windows were complete before."""
         records = manifest.windows
         return StackReport(
             frames=sum(record.written for record in records),
@@ -320,30 +354,29 @@ def run_to_file(
             failed=sum(record.error is not None for record in records),
             bad_frames=len(manifest.bad_frames),
             resumed=resumed,
-            seconds=time.perf_counter() - start,
-            first=None,
-            manifest=path,
+            seconds=time.perf_counter() - self._start,
+            first=first,
+            manifest=self.manifest,
             not_kept=manifest.not_kept,
         )
 
-    if options.resume and not work_folder(sink).exists() and sink.exists() and path.exists():
-        complete = read_manifest(path)
-        difference = _difference({name: getattr(complete, name) for name in header}, header)
-        if difference:
-            raise ValueError(
-                f"{sink}: cannot resume: {difference}; resume with the settings of before, or write another output"
-            )
-        for written in (sink, path):
-            atomic.remove_abandoned(written)
-        return report(complete, len(complete.windows))
-    with closing(RunFolder(sink, header, resume=options.resume)) as folder, atomic.full_disk_named(sink, folder.kept):
+
+def run_to_file(
+    sink: Path,
+    options: FileRunOptions,
+    header: Table,
+    *,
+    inputs: Iterable[Path],
+    compute: Callable[[RunFolder], Table],
+    write: Callable[[RunFolder], None],
+) -> StackReport:
+    """A run whose windows ``compute`` adds to the folder, and whose output ``write`` writes from it."""
+    run = FileRun(sink, options.manifest, header, inputs)
+    complete = run.complete() if options.resume else None
+    if complete is not None:
+        return run.report(complete, len(complete.windows))
+    with run.folder(resume=options.resume) as folder:
         resumed = len(folder.records())
-        results = compute(folder)
-        atomic.make_folder(path.parent)
-        manifest = StackManifest(**header, **results, windows=tuple(folder.records()))
-        with atomic.whole_file(path) as part:
-            manifest.save(part)
+        with run.writing(folder, **compute(folder)) as manifest:
             write(folder)
-        sync(path.absolute().parent)  # the temporary folder is gone as well
-        folder.remove()
-        return report(manifest, resumed)
+    return run.report(manifest, resumed)

@@ -1,11 +1,10 @@
-"""Restoration of the frames of one window, with a check of each frame and a verdict; vibration that changes.
+"""Restoration of the frames of one window, with a check of each frame and a verdict.
 
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
-import math
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -13,14 +12,11 @@ from torch import Tensor
 
 from rsvib_torch.checks.values import MAX_NUMBER, beyond_full_scale
 from rsvib_torch.detection import MotionDetection
-from rsvib_torch.detection.shapes.free import vibration_in_place_of
 from rsvib_torch.frames.prepare import constant_frame, prepare_frames
 from rsvib_torch.imaging.sensor_model import sharpened
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
-from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.motion.vibration import VibrationStd
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import RestorationOptions
 from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError
@@ -29,6 +25,7 @@ from rsvib_torch.restoration.judge import judge_prepared
 from rsvib_torch.restoration.restore import check_optics, restore_prepared, unchanged_frames, warn_of_mosaic
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
+from rsvib_torch.stacks.window_motion import reliable_motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,83 +113,3 @@ def frame_fault(frame: Array | str, index: int, full_scale: float | None, nodata
         return f"frame {index} reaches {largest:.3g}, at most {MAX_NUMBER:g} is possible"
     rounding = 1e-7  # of float32, relative
     return constant_frame(index) if high - low <= rounding * largest else None
-
-
-_LEAST_FRAMES = 4  # fewer do not determine what a motion of any shape has in common in all frames
-# Reasons against an axis whose tones may change within the record
-_CHANGES = {"displacement_ambiguous", "rows_unexplained", "neighbours_unexplained"}
-
-
-def may_change(detection: DetectedVibration, num_frames: int) -> bool:
-    """Whether tones that change within the frames may be why an axis of a steady vibration is not reliable.
-
-    They are not if the frames agree with another timing: a motion of any shape explains them with a wrong one as well.
-    """
-    codes = {one.code for of_axis in detection.findings for one in of_axis}
-    is_other_timing = any(code.startswith("other_") for code in codes)
-    return num_frames >= _LEAST_FRAMES and not is_other_timing and not _CHANGES.isdisjoint(codes)
-
-
-def equivalent_tones(found: MotionDetection, detection: DetectedVibration) -> DetectedVibration:
-    """``tones_in_place_of`` a detected motion, with the reasons against the tones of the ``detection`` as assumptions.
-
-    A wrong timing and lost frames have the same reasons as a vibration that changes.
-    """
-    against = zip(AXIS_NAMES, detection.findings, strict=False)
-    refused = tuple(
-        f"the vibration changes; tones along {name} are refused: {one}" for name, of in against for one in of
-    )
-    first, last = float(found.times.min()), float(found.times.max())
-    std, interval = found.std.square().mean((0, 1)).sqrt(), float(found.times[:, 0].diff().mean())
-    tones = tones_in_place_of(found.motion, first, last, std, interval)
-    return replace(
-        tones, residual=found.unexplained, reliable=found.reliable, findings=found.findings, assumptions=refused
-    )
-
-
-def tones_of_given(motion: FreeMotion, timing: SensorTiming, num_frames: int, rows: int) -> DetectedVibration:
-    """``tones_in_place_of`` a motion of a window that was measured before, whose standard deviations are unknown."""
-    starts = timing.frame_starts(num_frames)
-    last = float(starts[-1]) + (rows - 1) * timing.row_time + timing.exposure_time
-    unknown = torch.full((motion.num_axes,), math.inf, dtype=torch.float64, device=motion.coefficients.device)
-    return tones_in_place_of(motion, float(starts[0]), last, unknown, float(starts.diff().mean()))
-
-
-def tones_in_place_of(
-    motion: FreeMotion, first: float, last: float, displacement: Tensor, interval: float
-) -> DetectedVibration:
-    """A tone for each axis of a motion of any shape, to draw it and list it beside the tones of other windows.
-
-    The standard deviation of the frequency is half of the resolution of the record, which is that from ``first`` to
-    ``last`` (s) with frames every ``interval``; ``displacement`` (A,) is the standard deviation of the motion.
-    """
-    vibration = vibration_in_place_of(motion, first, last)
-    amplitude, frequency = vibration.amplitude, vibration.frequency
-    unknown = torch.full_like(amplitude, math.inf)
-    by_frequency = torch.full_like(amplitude, 0.5 / (last - first))
-    std = VibrationStd(
-        amplitude=math.sqrt(2) * displacement[:, None],
-        frequency=by_frequency,
-        phase=unknown,
-        period=by_frequency / frequency.square().clamp(min=1e-300),
-        image_motion=math.sqrt(12) * displacement / (last - first),
-        image_acceleration=unknown[:, 0],
-        displacement=displacement,
-    )
-    moves = motion.moving_axes()
-    none, findings = torch.zeros_like(displacement), tuple(() for _ in moves)
-    return DetectedVibration(vibration, std, vibration.gain(interval), none, moves, findings, assumptions=())
-
-
-def reliable_motion(found: MotionDetection) -> tuple[FreeMotion, tuple[Reason, ...]]:
-    """A motion of any shape without the axes that are not reliable, and a reason for each of these."""
-    motion, factor = found.motion, found.reliable.to(found.motion.coefficients)
-    kept = FreeMotion(
-        motion.coefficients * factor[:, None], motion.start, motion.spacing, motion.tones.scaled(factor), motion.camera
-    )
-    refused = [
-        Reason("axis_not_reliable", name, details={"action": "restored", "why": "; ".join(reasons)})
-        for name, reasons in zip(AXIS_NAMES, found.reasons, strict=False)
-        if reasons
-    ]
-    return kept, tuple(refused)
