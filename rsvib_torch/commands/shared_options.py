@@ -21,7 +21,7 @@ from rsvib_torch.config import Config, read_config
 from rsvib_torch.files.atomic import check_outputs, check_writable
 from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.timing import SensorSection, SensorTiming
-from rsvib_torch.options import RestorationOptions, method_options
+from rsvib_torch.options import ProcessStackOptions, RestorationOptions, WindowOptions, method_options
 from rsvib_torch.text import AXES
 
 if TYPE_CHECKING:
@@ -135,7 +135,7 @@ class StackCommand(CameraOptions):
     """A command that reads a stack of frames."""
 
     frames: Path = argument()
-    """Stack of frames: TIFF, .npy, HDF5, video, or a folder of PNG, TIFF or JPEG files. NAME[100:200] are
+    """Stack of frames: TIFF, .npy, HDF5, video and others, or a folder of PNG, TIFF or JPEG files. NAME[100:200] are
     its frames 100 to 199, from the first of which times count."""
 
     device: DeviceName = "auto"
@@ -178,7 +178,7 @@ class StackCommand(CameraOptions):
 
 
 @options
-class RestorationCommand(StackCommand):
+class RestoringCommand(StackCommand):
     """A command that restores the frames with options of ``restore``."""
 
     restoration: Annotated[
@@ -195,13 +195,36 @@ class RestorationCommand(StackCommand):
             },
         ),
     ]
+    processing: Annotated[
+        Table,
+        Given(
+            ProcessStackOptions,
+            forms={
+                "window": {
+                    "text": "Largest number of frames that are processed together; of restore --vibration all.",
+                    "show_default": "from the configuration, or 8",
+                }
+            },
+        ),
+    ]
     force: bool = False
     """Write the restored frames even if they are judged no better than the input."""
 
+    @property
+    def window(self) -> int:
+        """Largest number of frames that are processed together."""
+        return int((self.settings.stack | self.processing).get("window", WindowOptions().window))
+
+    @property
+    def replaces(self) -> bool:
+        """Whether results that exist may be replaced."""
+        return self.overwrite or "resume" in self.processing
+
     @cached_property
     def of_stack(self) -> Table:
-        """Options of the functions for stacks: full scale, device, and options of ``restore``."""
-        return {"full_scale": self.scale, "restoration": self._chosen(), "device": str(self.torch_device)}
+        """Options of the functions for stacks: those given, full scale, device, and options of ``restore``."""
+        device = str(self.torch_device)
+        return self.processing | {"full_scale": self.scale, "restoration": self._chosen(), "device": device}
 
     def _chosen(self) -> Table:
         """Options of ``restore``: those of the configuration file, replaced by those of the command line."""

@@ -14,11 +14,13 @@ from statistics import median, stdev
 import numpy as np
 
 from rsvib_torch.checks.arguments import checks_arguments
+from rsvib_torch.checks.values import fields_of
 from rsvib_torch.files.reading import Table
 from rsvib_torch.io.stack_info import split_range
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.options import StackOptions
 from rsvib_torch.results.presentation import (
     AXIS_NAMES,
     Result,
@@ -170,33 +172,33 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
 
         If the vibration changes in windows, it has the amplitudes in the first and in the last one.
         """
+        tones = {name: of_axis["tones"] for name, of_axis in self.totals()["tones"].items()}
         rows, count, changing = [], len(self.windows), self._changing
-        for name, of_axis in self.totals()["tones"].items():
-            for tone in of_axis["tones"]:
-                texts = [
-                    measured_text(tone[name], tone[f"{name}_spread"] or None) for name in ("amplitude", "frequency")
-                ]
+        for axis, of_axis in tones.items():
+            for tone in of_axis:
+                amplitude, frequency = (
+                    measured_text(tone[quantity], tone[f"{quantity}_spread"] or None)
+                    for quantity in ("amplitude", "frequency")
+                )
                 if changing and tone["windows"] > 1:
-                    texts[0] = f"{tone['first']:.4g} … {tone['last']:.4g}"
-                rows.append([name, f"{tone['windows']} of {count}", *texts])
-            rows += [] if of_axis["tones"] else [[name, f"0 of {count}", "", ""]]
-        table = text_table(["axis", "reliable windows", "amplitude (px)", "frequency (Hz)"], rows)
-        spread = "median ± standard deviation over the windows"
-        if not changing:
-            return [table, spread]
-        which = "all" if changing == count else f"{changing} of {count}"
-        text = f"no steady tones explain {which} windows, whose motion was therefore measured without tones"
-        refused: dict[object, str] = {
-            record.window: "; ".join(map(str, record.detection.assumptions))
-            for record in self.windows
-            if record.detection is not None and record.motion is not None and record.detection.assumptions
-        }
-        return [
-            table,
-            f"amplitude: in the first and the last window; frequency: {spread}",
-            wrapped(f"{text}; amplitudes are those of a tone of the same rms displacement"),
-            *(wrapped(f"assumed in {text}") for text in _first_of(refused)),
-        ]
+                    amplitude = f"{tone['first']:.4g} … {tone['last']:.4g}"
+                rows.append([axis, f"{tone['windows']} of {count}", amplitude, frequency])
+            rows += [] if of_axis else [[axis, f"0 of {count}", "", ""]]
+        lines = [text_table(["axis", "reliable windows", "amplitude (px)", "frequency (Hz)"], rows)]
+        if any(tones.values()):
+            spread = "median ± standard deviation over the windows"
+            lines.append(f"amplitude: in the first and the last window; frequency: {spread}" if changing else spread)
+        if changing:
+            which = "all" if changing == count else f"{changing} of {count}"
+            measured = f"no steady tones explain {which} windows, whose motion was therefore measured without tones"
+            lines.append(wrapped(f"{measured}; amplitudes are those of a tone of the same rms displacement"))
+            refused: dict[object, str] = {
+                record.window: "; ".join(map(str, record.detection.assumptions))
+                for record in self.windows
+                if record.detection is not None and record.motion is not None and record.detection.assumptions
+            }
+            lines += [wrapped(f"assumed in {note}") for note in _first_of(refused)]
+        return lines
 
     def _lines_of_video(self) -> list[str]:
         """Axes of a video that were restored although they are not reliable, and the first assumption."""
@@ -307,7 +309,7 @@ def fingerprint(path: Path) -> Table:
 
 
 # options on which the result depends
-_SETTINGS = ("full_scale", "window", "detection", "restoration", "force", "device")
+_SETTINGS = tuple(name for name in fields_of(StackOptions) if name not in ("memory", "workers"))
 
 
 def manifest_header(job: StackJob, output: str | None, compression: str | None) -> Table:
