@@ -15,7 +15,7 @@ from rsvib_torch.checks.values import fields_of, options
 from rsvib_torch.commands import answers
 from rsvib_torch.commands.flat_command import Given, argument
 from rsvib_torch.commands.shared_options import PixelSizeOptions, RestoringCommand, VerdictOptions
-from rsvib_torch.commands.stack_commands import print_notes
+from rsvib_torch.commands.stack_commands import print_notes, process
 from rsvib_torch.commands.terminal import Answer, current_output, warn, working
 from rsvib_torch.files.atomic import whole_folder
 from rsvib_torch.files.reading import Table
@@ -125,18 +125,16 @@ def run(given: RunCommand) -> Answer:
 
 def _process(given: RunCommand) -> stacks.StackReport:
     """Process a stack in windows; the first one is computed again if it was complete before."""
-    of_run = given.of_stack | {"window": given.window, "force": given.force, "detection": given.settings.detection}
-    of_run["manifest"] = given.out / "manifest.json"
-    frames, timing, counts = given.frames, given.settings.timing, given.info.shape[0] > given.window
-    with working(f"restoring {frames.name}", counts=counts) as progress:
-        result = stacks.process_stack(frames, given.restored, timing, **of_run, progress=progress if counts else None)
-    if result.bad_frames:
-        warn(f"{number_of(result.bad_frames, 'frame')} could not be used: see manifest.json")
-    answers.note_lost(given.restored, result.not_kept)
-    if result.first is not None:
-        return result
+    of_run = given.of_stack | {"detection": given.settings.detection}
+    report = process(given, given.restored, of_run | {"manifest": given.out / "manifest.json"})
+    if report.bad_frames:
+        warn(f"{number_of(report.bad_frames, 'frame')} could not be used: see manifest.json")
+    if report.first is not None:
+        return report
+    of_run |= {"window": given.window, "force": given.force}
     of_windows = {name: value for name, value in of_run.items() if name in fields_of(StackOptions)}
-    return replace(result, first=next(iter(stacks.iterate_stack(frames, timing, **of_windows))))
+    first = next(iter(stacks.iterate_stack(given.frames, given.settings.timing, **of_windows)))
+    return replace(report, first=first)
 
 
 def _process_video(given: RunCommand) -> stacks.StackReport:

@@ -43,6 +43,17 @@ def print_notes(info: io.StackInfo, config: Config) -> None:
         note(sentence)
 
 
+def process(given: shared.RestoringCommand, restored: Path, of_run: Table) -> stacks.StackReport:
+    """Process a stack in windows, with the options of the command and those of the run."""
+    of_run = Table(window=given.window, force=given.force) | given.of_stack | of_run
+    counts = given.info.shape[0] > of_run["window"]
+    with working(f"restoring {given.frames.name}", counts=counts) as progress:
+        of_run["progress"] = progress if counts else None
+        report = stacks.process_stack(given.frames, restored, given.settings.timing, **of_run)
+    answers.note_lost(restored, report.not_kept)
+    return report
+
+
 @options
 class DetectCommand(shared.StackCommand, shared.PixelSizeOptions, shared.VerdictOptions):
     """Options of ``detect``."""
@@ -140,35 +151,30 @@ def restore(given: RestoreCommand) -> Answer:
     explain them are refused. If the restored frames are judged no better than the input, the input is written
     unchanged. --force restores in both cases.
     """
-    settings, frames, vibration = given.settings, given.frames, given.vibration
+    settings, vibration = given.settings, given.vibration
     outputs = [*io.stack_files(given.restored), given.manifest]
     shared.check_new(outputs, given.replaces, [*given.inputs, vibration, given.motion, given.lens_profile])
     current_output().work = stacks.work_folder(given.restored)
     check_writable(given.restored, folder=not given.restored.suffix)
-    info, scale, chosen = given.info, given.scale, given.of_stack["restoration"]
-    of_run = given.of_stack | {"force": given.force, "window": given.window}
     # 1. The vibration of all frames, or the motion on the clock of the frames.
+    info, of_run = given.info, Table()
     if vibration is not None and given.motion is None:
         of_recordings = ("offset", "unit", "ignore", "focal_length", "lens_profile")
         if useless := [name for name in of_recordings if getattr(given, name) not in (None, ())]:
             option = useless[0].replace("_", "-")
             raise ValueError(f"--{option} is for --motion, a recording; --vibration is that of the frames themselves")
         detected = reports.read_vibration(vibration, io.timing_from_first_frame(settings.timing, info))
-        stacks.check_stack_fits(info, chosen, on_gpu=given.torch_device.type != "cpu")
+        stacks.check_stack_fits(info, given.of_stack["restoration"], on_gpu=given.torch_device.type != "cpu")
         print_notes(info, settings)
         of_run |= {"given": [detected], "window": max(2, info.shape[0])}
         answer = Answer({"Vibration": [detected.summary()]}, {"detection": answers.detection_data(detected)})
     elif given.motion is not None and vibration is None:
         answer = Answer({}, {"alignment": None})
-        of_run["motion"] = _motion_of_frames(given, given.motion, replace(info, full_scale=scale), answer)
+        of_run["motion"] = _motion_of_frames(given, given.motion, replace(info, full_scale=given.scale), answer)
     else:
         raise ValueError("give --vibration FILE, or --motion FILE of a recording")
     # 2. Restoration in windows.
-    counts = info.shape[0] > of_run["window"]
-    with working(f"restoring {frames.name}", counts=counts) as progress:
-        of_run["progress"] = progress if counts else None
-        run = stacks.process_stack(frames, given.restored, settings.timing, **of_run)
-    answers.note_lost(given.restored, run.not_kept)
+    run = process(given, given.restored, of_run)
     answer.results["Restoration"], answer.data["restoration"] = answers.restoration_of(run)
     answer.files += [given.restored, given.manifest]
     return answer

@@ -32,8 +32,13 @@ from rsvib_torch.options import (
 )
 from rsvib_torch.restoration.restore import check_optics
 from rsvib_torch.stacks.memory import windows_at_once
-from rsvib_torch.stacks.window_motion import known_motion, measured_motion
-from rsvib_torch.stacks.window_restoration import frame_fault, restore_trusted, without_data
+from rsvib_torch.stacks.window_restoration import (
+    frame_fault,
+    known_motion,
+    measured_motion,
+    restore_trusted,
+    without_data,
+)
 from rsvib_torch.stacks.windows import StoredWindow, Window, WindowRecord, WindowResult, cut_windows, window_timing
 
 WindowFrames = list[Array | str]  # pixels as stored, or why a frame cannot be read
@@ -149,8 +154,8 @@ class StackJob:
             middle = window.written[window.kept // 2]
             written = [middle] if self.is_joined else window.written
             frames = [counts(restored[index]) if index in restored else as_taken(index) for index in written]
-        record = WindowRecord.of(result, self.timing, len(frames))
-        return StoredWindow(record, frames, result if window.index == 0 else None)
+        record, first = WindowRecord.of(result, self.timing, len(frames)), result if window.index == 0 else None
+        return StoredWindow(record, np.ascontiguousarray(np.stack(frames)), first)  # channels may be stored last
 
     def _unchanged(self, frames: Tensor) -> Tensor:
         """Frames that were not restored, in the shape of restored ones."""

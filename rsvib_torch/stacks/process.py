@@ -10,7 +10,6 @@ from contextlib import closing
 from pathlib import Path
 from typing import TypeVar
 
-import numpy as np
 import torch
 
 from rsvib_torch.checks.arguments import PathLike
@@ -136,12 +135,12 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
     out = job.info.with_frames(len(windows) if job.is_joined else job.info.shape[0])
     out = job.content(out.restored_as(job.chosen.scale, job.chosen.mosaic), timing)
     form = check_info_target(sink, out, compression, check_folder=False)
-    run = FileRun(sink, options.manifest, manifest_header(job, sink.name, compression), stack_files(source))
+    run = FileRun(sink, options, manifest_header(job, sink.name, compression), stack_files(source))
     # 2. A complete output is not computed again.
-    complete = run.complete() if options.resume else None
-    if complete is not None:
-        return run.report(complete, len(complete.windows))
-    with run.folder(resume=options.resume) as folder:
+    finished = run.finished()
+    if finished is not None:
+        return finished
+    with run.folder() as folder:
         records = folder.records()
         missing, resumed = [window for window in windows if window.index not in folder], len(records)
         # the finished windows and the output are on the disk together, until the output is complete
@@ -158,9 +157,7 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
                 if _all_failed(records, len(windows)):
                     folder.remove()
                     raise ValueError(records[0].error)
-                # channels may be stored last
-                array = np.ascontiguousarray(np.stack(made.frames)) if made.frames else None
-                folder.add(made.record, array=array)
+                folder.add(made.record, array=made.frames)
                 count(window.kept)
         # 4. The output from the windows in the folder, and the manifest.
         with run.writing(folder, not_kept=metadata_not_kept(job.info, sink, out.shape)) as manifest:

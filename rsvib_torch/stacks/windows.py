@@ -153,5 +153,5 @@ class StoredWindow:
     """A window as it is stored on the disk."""
 
     record: WindowRecord
-    frames: list[Array]  # those that are written, as the file has them
+    frames: Array  # those that are written, as the file has them
     result: WindowResult | None  # of the first window of the stack, for the summary of the run
