@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from rsvib_torch import detection, io, stacks
 from rsvib_torch import report as reports
 from rsvib_torch.commands.shared_options import check_new
-from rsvib_torch.commands.terminal import Answer, note, warn, working
+from rsvib_torch.commands.terminal import Answer, warn, working
 from rsvib_torch.files.atomic import check_writable
 from rsvib_torch.files.reading import Table
 from rsvib_torch.text import AXES, number_of, printable, wrapped
@@ -179,12 +179,6 @@ def write_windows(folder: Path, manifest: stacks.StackManifest, pixel_size: floa
             return ["tones.csv"]
         reports.save_figure(manifest.plot(), folder / "windows.png")
     return ["windows.png", "tones.csv"]
-
-
-def note_lost(path: Path, names: Sequence[str]) -> None:
-    """Print which metadata of the input a file does not contain."""
-    if names:
-        note(f"{path}: not kept from the input: {', '.join(names)}")
 
 
 def warn_of_failures(manifest: stacks.StackManifest) -> None:

@@ -15,7 +15,6 @@ from rsvib_torch.checks.values import fields_of, options
 from rsvib_torch.commands import answers
 from rsvib_torch.commands.flat_command import Given, argument
 from rsvib_torch.commands.shared_options import PixelSizeOptions, RestoringCommand, VerdictOptions
-from rsvib_torch.commands.stack_commands import print_notes, process
 from rsvib_torch.commands.terminal import Answer, current_output, warn, working
 from rsvib_torch.files.atomic import whole_folder
 from rsvib_torch.files.reading import Table
@@ -90,10 +89,10 @@ def run(given: RunCommand) -> Answer:
     current windows; --resume continues. With --video, the vibration of a video is followed frame by frame: --steady 1
     --border crop makes a shaky video steady.
     """
-    out, restored = given.out, given.restored
+    settings, out, restored = given.settings, given.out, given.restored  # a mistake in settings needs no torch
     answers.check_folder(out, _RESULTS, given.replaces, given.inputs, restored)
     current_output().work = stacks.work_folder(restored)
-    print_notes(given.info, given.settings)
+    given.print_notes()
     # 1. The restored frames and their manifest.
     result = _process_video(given) if given.is_followed else _process(given)
     stored, first = stacks.read_manifest(result.manifest), result.first
@@ -108,6 +107,8 @@ def run(given: RunCommand) -> Answer:
         names = [restored.name, *drawn] if given.is_followed else [*drawn, restored.name]
         answer, tables = _describe(folder, given, result, page, stored)
         names += ["manifest.json", *tables]
+        if not given.video and io.is_video(given.frames) and result.restored < result.windows:
+            answer.next_steps.insert(0, answers.run_step(given.frames, out / "followed", settings.arguments))
         if given.report:
             pages = _write_page(folder, page, stored, answer)
             answers.check_folder(out, pages, overwrite=True, inputs=given.inputs)
@@ -126,7 +127,7 @@ def run(given: RunCommand) -> Answer:
 def _process(given: RunCommand) -> stacks.StackReport:
     """Process a stack in windows; the first one is computed again if it was complete before."""
     of_run = given.of_stack | {"detection": given.settings.detection}
-    report = process(given, given.restored, of_run | {"manifest": given.out / "manifest.json"})
+    report = given.process(given.restored, of_run | {"manifest": given.out / "manifest.json"})
     if report.bad_frames:
         warn(f"{number_of(report.bad_frames, 'frame')} could not be used: see manifest.json")
     if report.first is not None:
@@ -209,8 +210,6 @@ def _describe(
         answer = Answer({title: stored.lines()[0]}, {"windows": stored.totals()})
         answer.reliable = answers.verdicts([record.detection for record in stored.windows])
         answer.results["Restoration"] = [result.summary(), *stored.lines()[1][1:]]
-    if not given.video and io.is_video(frames) and result.restored < result.windows:
-        answer.next_steps.insert(0, answers.run_step(frames, given.out / "followed", given.settings.arguments))
     return answer, names
 
 

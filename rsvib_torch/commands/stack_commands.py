@@ -13,7 +13,7 @@ from rsvib_torch.checks.values import options
 from rsvib_torch.commands import answers
 from rsvib_torch.commands import shared_options as shared
 from rsvib_torch.commands.flat_command import Given, argument, option
-from rsvib_torch.commands.terminal import Answer, current_output, note, warn, working
+from rsvib_torch.commands.terminal import Answer, current_output, warn, working
 from rsvib_torch.files.atomic import check_writable, whole_folder
 from rsvib_torch.files.reading import Table
 from rsvib_torch.options import FreeMotionOptions, MotionUnit
@@ -21,7 +21,6 @@ from rsvib_torch.options import FreeMotionOptions, MotionUnit
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from rsvib_torch.config import Config
     from rsvib_torch.io.stack_info import StackInfo
 
 
@@ -33,25 +32,8 @@ def load(given: shared.StackCommand) -> tuple[Tensor, rsvib_torch.SensorTiming]:
     stacks.check_stack_fits(given.info, on_gpu=given.torch_device.type != "cpu")
     with working(f"reading {given.frames}"):
         frames = io.read_stack(given.frames, full_scale=given.scale)
-    print_notes(given.info, given.settings)
+    given.print_notes()
     return frames.to(given.torch_device), io.timing_from_first_frame(given.settings.timing, given.info)
-
-
-def print_notes(info: io.StackInfo, config: Config) -> None:
-    """Print what the file states about orientation, dropped frames and unequal intervals."""
-    for sentence in io.describe_stack(info, config.timing):
-        note(sentence)
-
-
-def process(given: shared.RestoringCommand, restored: Path, of_run: Table) -> stacks.StackReport:
-    """Process a stack in windows, with the options of the command and those of the run."""
-    of_run = Table(window=given.window, force=given.force) | given.of_stack | of_run
-    counts = given.info.shape[0] > of_run["window"]
-    with working(f"restoring {given.frames.name}", counts=counts) as progress:
-        of_run["progress"] = progress if counts else None
-        report = stacks.process_stack(given.frames, restored, given.settings.timing, **of_run)
-    answers.note_lost(restored, report.not_kept)
-    return report
 
 
 @options
@@ -165,7 +147,7 @@ def restore(given: RestoreCommand) -> Answer:
             raise ValueError(f"--{option} is for --motion, a recording; --vibration is that of the frames themselves")
         detected = reports.read_vibration(vibration, io.timing_from_first_frame(settings.timing, info))
         stacks.check_stack_fits(info, given.of_stack["restoration"], on_gpu=given.torch_device.type != "cpu")
-        print_notes(info, settings)
+        given.print_notes()
         of_run |= {"given": [detected], "window": max(2, info.shape[0])}
         answer = Answer({"Vibration": [detected.summary()]}, {"detection": answers.detection_data(detected)})
     elif given.motion is not None and vibration is None:
@@ -174,7 +156,7 @@ def restore(given: RestoreCommand) -> Answer:
     else:
         raise ValueError("give --vibration FILE, or --motion FILE of a recording")
     # 2. Restoration in windows.
-    run = process(given, given.restored, of_run)
+    run = given.process(given.restored, of_run)
     answer.results["Restoration"], answer.data["restoration"] = answers.restoration_of(run)
     answer.files += [given.restored, given.manifest]
     return answer
@@ -184,7 +166,7 @@ def _motion_of_frames(given: RestoreCommand, path: Path, info: StackInfo, answer
     """A recorded motion on the clock of the frames, which is stated or estimated."""
     recorded, timing = _recorded(given, path), given.settings.timing
     ignore = stacks.mask_of_regions(given.ignore or (), (info.shape[-2], info.shape[-1]))
-    print_notes(info, given.settings)
+    given.print_notes()
     if isinstance(recorded, rsvib_torch.FreeMotion):
         if given.offset is None:
             raise ValueError(f"--unit {given.unit} needs --offset: the time of the recording when frame 0 begins, in s")

@@ -262,24 +262,19 @@ _SAME_TONE = 0.03  # of the frequency, or 4 std: a tone of the next window close
 def _tones_over_windows(found: Sequence[DetectedVibration | None], axis: int) -> Table:
     """Number of windows in which an axis is reliable, and median and spread of its tones over them, strongest first.
 
-    The tones of a window continue those of nearly the same frequency in the windows before, the nearest ones first.
+    The tones of a window, the strongest first, continue those of nearly the same frequency in the windows before.
     """
     reliable = [one for one in found if one is not None and axis < one.vibration.num_axes and bool(one.reliable[axis])]
     tones: list[list[tuple[float, float]]] = []  # (amplitude, frequency) in the windows of each tone
     for one in reliable:
-        columns = (
-            values[axis].tolist() for values in (one.vibration.amplitude, one.vibration.frequency, one.std.frequency)
-        )
-        new = [(a, f, max(_SAME_TONE * f, 4 * s)) for a, f, s in zip(*columns, strict=True) if a > 0]
-        steps = ((abs(f - tone[-1][1]), i, j) for i, (_, f, _) in enumerate(new) for j, tone in enumerate(tones))
-        pairs: dict[int, int] = {}  # number of the tone that each one of this window continues
-        for step, i, j in sorted(steps):
-            if i not in pairs and j not in pairs.values() and step <= new[i][2]:
-                pairs[i] = j
-        for i, (amplitude, frequency, _) in enumerate(new):
-            if i not in pairs:
-                tones.append([])
-            tones[pairs.get(i, -1)].append((amplitude, frequency))
+        columns = (one.vibration.amplitude, one.vibration.frequency, one.std.frequency)
+        earlier = list(tones)
+        for amplitude, frequency, std in zip(*(values[axis].tolist() for values in columns), strict=True):
+            distances = [abs(frequency - tone[-1][1]) for tone in earlier]
+            if amplitude > 0 and distances and min(distances) <= max(_SAME_TONE * frequency, 4 * std):
+                earlier.pop(distances.index(min(distances))).append((amplitude, frequency))
+            elif amplitude > 0:
+                tones.append([(amplitude, frequency)])
     described: list[Table] = []
     for tone in tones:
         described.append({"windows": len(tone), "first": tone[0][0], "last": tone[-1][0]})
