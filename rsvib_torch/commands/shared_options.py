@@ -11,9 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from rsvib_torch import frames as preparation
 from rsvib_torch import gyroscope, io, stacks
-from rsvib_torch import restoration as restore
 from rsvib_torch.checks.values import options
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.terminal import note, working
@@ -247,15 +245,12 @@ class RestoringCommand(StackCommand):
                 raise ValueError(f"--joint must be 'all' or a number of frames, got {given['joint']!r}")
             given["joint"] = given["joint"] == "all" or int(given["joint"])
         options |= given
-        checked = RestorationOptions(**options)
+        RestorationOptions(**options)  # raises an error for wrong ones
         if options.get("saturation") == "auto":
             del options["saturation"]
         level = options.get("saturation", full_scale)  # None: no pixels are saturated
         if info.is_integer and full_scale is not None and level is not None:  # of frames whose full scale is 1
             options["saturation"] = level / full_scale
-        if checked.mosaic is not None:
-            preparation.check_mosaic(checked.mosaic, info.shape)
-        restore.check_optics(checked.optics)
         return options
 
 

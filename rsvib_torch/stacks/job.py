@@ -1,6 +1,5 @@
 """What a run over a stack is: its settings and windows, and the computation of one window from its frames."""
 
-import os
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -234,7 +233,6 @@ def plan_job(
     check_choice("device", options.device.partition(":")[0], ("auto", "cpu", "cuda"))
     default = "cuda" if torch.cuda.is_available() else "cpu"
     device = default if options.device == "auto" else options.device
-    on_gpu = device != "cpu"
     restoration = (options.restoration or {}) if isinstance(options, StackOptions) else None
     of_job = {"full_scale": full_scale, "device": device, "restoration": restoration, "progress": None}
     stated = ProcessStackOptions(**{**vars(options), **of_job})
@@ -246,13 +244,7 @@ def plan_job(
     joint, most = job.chosen.joint, min(stated.window, info.shape[0])
     if joint is not True and joint > most:
         raise ValueError(f"joint must be at most {most}, the number of frames of a window, got {joint}")
-    if options.workers is not None:
-        most = options.workers
-    elif on_gpu:
-        most = 1
-    else:
-        most = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     at_once = windows_at_once(
-        info, stated.window, memory=options.memory, most=most, restoration=restoration, on_gpu=on_gpu
+        info, stated.window, restoration, memory=options.memory, workers=options.workers, on_gpu=device != "cpu"
     )
     return job, windows, at_once

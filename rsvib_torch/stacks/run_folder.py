@@ -196,8 +196,9 @@ class FileRun:
 
     def finished(self) -> StackReport | None:
         """The summary of a run to be resumed that is complete; an error if it is one with other settings."""
-        exist = self.sink.exists() and self.manifest.exists() and not work_folder(self.sink).exists()
-        if not (self._resume and exist):
+        if not self._resume or os.path.lexists(work_folder(self.sink)):
+            return None
+        if not (self.sink.exists() and self.manifest.exists()):
             return None
         manifest = read_manifest(self.manifest)
         difference = _difference({name: getattr(manifest, name) for name in self.header}, self.header)

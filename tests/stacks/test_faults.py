@@ -86,6 +86,15 @@ def test_resuming_a_complete_run_changes_nothing(whole, tmp_path):
     assert (tmp_path / "out.npy").stat().st_mtime_ns == before
 
 
+def test_a_link_to_itself_in_place_of_the_folder_of_a_complete_run_is_refused(whole, tmp_path):
+    process_small(whole / "frames.tif", tmp_path / "out.npy")
+    link = work_folder(tmp_path / "out.npy")
+    link.symlink_to(link.name)
+    with pytest.raises(FileExistsError, match="was not made by a run, it is a link"):
+        process_small(whole / "frames.tif", tmp_path / "out.npy", resume=True)
+    assert link.is_symlink()
+
+
 def test_full_disk_is_an_error_before_the_computation(whole, tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=100_000))
     with pytest.raises(OSError, match=r"No space left on device: a run needs 418 KB, 100 KB are free"):
