@@ -7,7 +7,7 @@ LAYERS: tuple[dict[str, str], ...] = (
     {"video": "process_video.py: videos in two passes; steadying.py; session.py: a running camera"},
     {"report": "results on disk: JSON, CSV, figures (plots.py), HTML page (page.py)"},
     {"config": "TOML files ↔ groups of options"},
-    {"stacks": "process.py: the loop over windows; job.py: one window; run_folder.py: runs to a file, resumed"},
+    {"stacks": "process.py: the loop over windows; job.py: a window; run_folder.py: how runs are stored and resumed"},
     {"io": "stack_reading.py, stack_writing.py, formats.py (table of formats), one module per format"},
     {
         "evaluation": "image quality, MTF of a slanted edge (slanted_edge.py), Cramér–Rao bound",

@@ -124,18 +124,17 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
         windows, found = self.windows, self._tones
         gains = [record.predicted_gain for record in windows if record.predicted_gain is not None]
         names = AXIS_NAMES[: max((one.vibration.num_axes for one in found if one is not None), default=2)]
-        unchanged: dict[str, Table] = {name: {} for name in names}
-        for record in windows:
-            for reason in record.left_alone:
-                if reason.axis in unchanged:
-                    unchanged[reason.axis][str(record.window)] = reason.to_dict()
+        unchanged = [(reason.axis, record.window, reason) for record in windows for reason in record.left_alone]
         return {
             "windows": len(windows),
             "restored": sum(record.frames == "restored" for record in windows),
             "outcomes": dict(Counter(record.outcome for record in windows if record.outcome is not None)),
             "predicted_gain_db": {"lowest": min(gains), "highest": max(gains)} if gains else None,
             "tones": {name: _tones_over_windows(found, axis) for axis, name in enumerate(names)},
-            "left_alone": unchanged,
+            "left_alone": {
+                name: {str(window): reason.to_dict() for axis, window, reason in unchanged if axis == name}
+                for name in names
+            },
             "errors": {str(record.window): record.error for record in windows if record.error is not None},
             "bad_frames": self.bad_frames,
         }
@@ -144,12 +143,10 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
         """The totals as lines of text: about the vibration, and about the restoration."""
         data = self.totals()
         # All windows were measured, and nothing else than missing tones is stated against any axis.
-        codes = {
-            "failed" if one is None else one.codes((axis,))
+        is_still = bool(self.windows) and all(
+            one is not None and all(one.codes((axis,)) == "no_tone" for axis in range(one.vibration.num_axes))
             for one in self._tones
-            for axis in range(2 if one is None else one.vibration.num_axes)
-        }
-        is_still = codes == {"no_tone"}
+        )
         vibration = self._tone_lines() if self.gyroscope is None else _gyroscope_lines(self.gyroscope)
         if is_still:
             text = "no window has a significant tone"
