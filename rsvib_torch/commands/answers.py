@@ -183,7 +183,7 @@ def write_windows(folder: Path, manifest: stacks.StackManifest, pixel_size: floa
 
 def warn_of_failures(manifest: stacks.StackManifest) -> None:
     """Print a warning if detection or restoration failed in windows."""
-    failed = sum(record.error is not None for record in manifest.windows)
+    failed = [record for record in manifest.windows if record.error is not None]
     if failed:
-        error = next(record for record in manifest.windows if record.error is not None)
-        warn(f"detection failed in {number_of(failed, 'window')}; in window {error.window}: {error.error}")
+        where = f"{number_of(len(failed), 'window')}; in window {failed[0].window}"
+        warn(f"detection failed in {where}: {failed[0].error}")

@@ -172,36 +172,23 @@ class StackCommand(CameraOptions):
         return torch.device("cuda" if self.device != "cpu" and torch.cuda.is_available() else "cpu")
 
 
+_JOINT: Table = {
+    "text": "Number of neighbouring frames that are restored jointly, or 'all' for one image of all frames (of each "
+    "window).",
+    "kind": str,
+}
+_WINDOW: Table = {
+    "text": "Largest number of frames that are processed together; of restore --vibration all.",
+    "show_default": "from the configuration, or 8",
+}
+
+
 @options
 class RestoringCommand(StackCommand):
     """A command that restores the frames with options of ``restore``."""
 
-    restoration: Annotated[
-        Table,
-        Given(
-            RestorationOptions,
-            default="from the configuration",
-            forms={
-                "joint": {
-                    "text": "Number of neighbouring frames that are restored jointly, or 'all' for one image of all "
-                    "frames (of each window).",
-                    "kind": str,
-                },
-            },
-        ),
-    ]
-    processing: Annotated[
-        Table,
-        Given(
-            ProcessStackOptions,
-            forms={
-                "window": {
-                    "text": "Largest number of frames that are processed together; of restore --vibration all.",
-                    "show_default": "from the configuration, or 8",
-                }
-            },
-        ),
-    ]
+    restoration: Annotated[Table, Given(RestorationOptions, default="from the configuration", forms={"joint": _JOINT})]
+    processing: Annotated[Table, Given(ProcessStackOptions, forms={"window": _WINDOW})]
     force: bool = False
     """Write the restored frames even if they are judged no better than the input."""
 
