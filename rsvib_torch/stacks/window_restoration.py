@@ -73,13 +73,7 @@ class WindowMotion:
 
     motion: DetectedVibration | MotionDetection | FreeMotion  # what ``restore_trusted`` undoes
     tones: DetectedVibration | None  # the vibration, or tones in its place; None of a recorded motion
-
-    @property
-    def free(self) -> FreeMotion | None:
-        """The motion of a vibration that changes; axes that are not reliable rest. None: ``tones`` are the motion."""
-        if isinstance(self.motion, MotionDetection):
-            return reliable_motion(self.motion)[0]
-        return self.motion if self.tones is not None and isinstance(self.motion, FreeMotion) else None
+    free: FreeMotion | None = None  # that of a vibration that changes, whose axes rest that are not reliable
 
 
 def measured_motion(frames: Tensor, timing: SensorTiming, options: Mapping[str, Any]) -> WindowMotion:
@@ -94,7 +88,7 @@ def measured_motion(frames: Tensor, timing: SensorTiming, options: Mapping[str, 
     with suppress(ValueError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
         found = detect_motion(frames, timing, knot_rows=min(24, max(4, rows // _KNOTS)))
         if found.reliable.sum() > detected.reliable.sum():
-            return WindowMotion(found, _tones_of_detected(found, detected))
+            return WindowMotion(found, _tones_of_detected(found, detected), reliable_motion(found)[0])
     return WindowMotion(detected, detected)
 
 
@@ -109,7 +103,8 @@ def known_motion(
     starts, rows = timing.frame_starts(len(frames)), frames.shape[int(timing.scan_axis)]
     last = float(starts[-1]) + (rows - 1) * timing.row_time + timing.exposure_time
     unknown = torch.full((given.num_axes,), math.inf, dtype=torch.float64, device=given.coefficients.device)
-    return WindowMotion(given, _tones_in_place_of(given, float(starts[0]), last, unknown, float(starts.diff().mean())))
+    tones = _tones_in_place_of(given, float(starts[0]), last, unknown, float(starts.diff().mean()))
+    return WindowMotion(given, tones, given)
 
 
 def may_change(detection: DetectedVibration, num_frames: int) -> bool:
