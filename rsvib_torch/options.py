@@ -307,10 +307,10 @@ class ResourceOptions:
 
     full_scale: Positive | None = None
     """As in ``read_stack``."""
-    memory: str | float | None = None
+    memory: str | float | None = Field(default=None, json_schema_extra=COMMAND_LINE)
     """Limit for the memory of the process, in bytes or like ``"2GB"``; by default three quarters of the memory that is
     free or used by the process."""
-    workers: Annotated[int, Field(ge=1)] | None = None
+    workers: Annotated[int, Field(ge=1)] | None = Field(default=None, json_schema_extra=COMMAND_LINE)
     """Largest number of windows, or of frames of a video, to compute at once; by default the number of processors."""
     device: str = "auto"
     """``"auto"``, ``"cpu"`` or ``"cuda"``."""
@@ -349,17 +349,17 @@ class DetectStackOptions(StackDetectionOptions, ProgressOptions):
 
 
 @options
-class RunOptions(ProgressOptions):
+class FileRunOptions(ProgressOptions):
     """A run from file to file."""
 
-    resume: bool = False
+    resume: bool = Field(default=False, json_schema_extra=COMMAND_LINE)
     """Whether to continue an interrupted run; a complete output is not changed."""
     manifest: FilePath = None
     """Path of the manifest; by default ``sink`` with ``.manifest.json`` appended."""
 
 
 @options
-class ProcessStackOptions(RunOptions, StackOptions):
+class ProcessStackOptions(FileRunOptions, StackOptions):
     """Options of ``process_stack``."""
 
     given: Detections = None
@@ -367,12 +367,12 @@ class ProcessStackOptions(RunOptions, StackOptions):
     motion: object = None
     """A ``FreeMotion`` of all frames to use instead of detections, such as a recorded one (``align_motion``): in image
     axes, with the exposure start of the first row of frame 0 as time origin. Frames are restored to its place 0."""
-    compression: str | None = None
+    compression: str | None = Field(default=None, json_schema_extra=COMMAND_LINE)
     """Compression of a TIFF stack, zlib or lzma, as in ``write_stack``."""
 
 
 @options
-class ProcessVideoOptions(RunOptions, ResourceOptions):
+class ProcessVideoOptions(FileRunOptions, ResourceOptions):
     """Options of ``process_video``; each of its two passes counts as half of the progress."""
 
     border: BorderName = "mirror"

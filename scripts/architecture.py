@@ -7,7 +7,7 @@ LAYERS: tuple[dict[str, str], ...] = (
     {"video": "process_video.py: videos in two passes; steadying.py; session.py: a running camera"},
     {"report": "results on disk: JSON, CSV, figures (plots.py), HTML page (page.py)"},
     {"config": "TOML files ↔ groups of options"},
-    {"stacks": "process.py: windows, jobs, memory planning; run_folder.py: a run to a file, and how it resumes"},
+    {"stacks": "process.py: the loop over windows; job.py: a window; run_folder.py: how runs are stored and resumed"},
     {"io": "stack_reading.py, stack_writing.py, formats.py (table of formats), one module per format"},
     {
         "evaluation": "image quality, MTF of a slanted edge (slanted_edge.py), Cramér–Rao bound",
@@ -32,7 +32,7 @@ LAYERS: tuple[dict[str, str], ...] = (
     {"checks": "checks of what users give: values, groups of options (values.py), arrays, arguments"},
     {
         "numerics": "splines, Fourier transforms, banded systems, tables of fits",
-        "files": "durable writes, bounded reads, paths of outputs, free memory",
+        "files": "durable writes, the locked folder of a run, bounded reads, paths of outputs, free memory",
     },
     {"execution": "chunks, threads, progress, precision", "text": "numbers, tables and JSON as text"},
 )

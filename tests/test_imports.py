@@ -115,9 +115,12 @@ def test_every_part_has_a_layer():
         assert parts(PACKAGE / package) - {"__init__"} == set().union(*layers)
 
 
-def test_no_two_modules_share_a_name():
+def test_no_two_modules_and_no_two_groups_of_options_share_a_name():
     names = [path.stem for path, _ in modules()]
-    assert sorted(names) == sorted(set(names))
+    groups = re.findall(r"^@options\nclass (\w+)", "\n".join(path.read_text() for path, _ in modules()), re.MULTILINE)
+    assert len(groups) > 20
+    for found in (names, groups):
+        assert sorted(found) == sorted(set(found))
 
 
 def test_modules_that_use_a_displacement_per_row_state_the_invariant():

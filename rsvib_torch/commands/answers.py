@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from rsvib_torch import detection, io, stacks
 from rsvib_torch import report as reports
 from rsvib_torch.commands.shared_options import check_new
-from rsvib_torch.commands.terminal import Answer, note, warn, working
+from rsvib_torch.commands.terminal import Answer, warn, working
 from rsvib_torch.files.atomic import check_writable
 from rsvib_torch.files.reading import Table
 from rsvib_torch.text import AXES, number_of, printable, wrapped
@@ -181,15 +181,9 @@ def write_windows(folder: Path, manifest: stacks.StackManifest, pixel_size: floa
     return ["windows.png", "tones.csv"]
 
 
-def note_lost(path: Path, names: Sequence[str]) -> None:
-    """Print which metadata of the input a file does not contain."""
-    if names:
-        note(f"{path}: not kept from the input: {', '.join(names)}")
-
-
 def warn_of_failures(manifest: stacks.StackManifest) -> None:
     """Print a warning if detection or restoration failed in windows."""
-    failed = sum(record.error is not None for record in manifest.windows)
+    failed = [record for record in manifest.windows if record.error is not None]
     if failed:
-        error = next(record for record in manifest.windows if record.error is not None)
-        warn(f"detection failed in {number_of(failed, 'window')}; in window {error.window}: {error.error}")
+        where = f"{number_of(len(failed), 'window')}; in window {failed[0].window}"
+        warn(f"detection failed in {where}: {failed[0].error}")

@@ -30,7 +30,8 @@ _COMMANDS: dict[str, Callable[..., Answer]] = {  # in the order of the help
     "live": live_session,
 }
 _EXAMPLES = """
-  rsvib init frames.tif --row-time 14.6us --exposure 1/500 --frame-rate 29.97
+  rsvib init frames.tif --row-time 14.6us --exposure 1/500 \\
+        --frame-rate 29.97 --full-scale 4095
   rsvib init clip.mp4 --camera "iPhone 12" --exposure 1/500
   rsvib cameras iphone 12
   rsvib cameras gopro --json

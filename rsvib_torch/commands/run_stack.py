@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,15 +11,14 @@ import rsvib_torch
 from rsvib_torch import detection, io, stacks, video
 from rsvib_torch import frames as preparation
 from rsvib_torch import report as reports
-from rsvib_torch.checks.values import options
+from rsvib_torch.checks.values import fields_of, options
 from rsvib_torch.commands import answers
 from rsvib_torch.commands.flat_command import Given, argument
-from rsvib_torch.commands.shared_options import PixelSizeOptions, RestorationCommand, VerdictOptions
-from rsvib_torch.commands.stack_commands import print_notes
+from rsvib_torch.commands.shared_options import PixelSizeOptions, RestoringCommand, VerdictOptions
 from rsvib_torch.commands.terminal import Answer, current_output, warn, working
 from rsvib_torch.files.atomic import whole_folder
 from rsvib_torch.files.reading import Table
-from rsvib_torch.options import ProcessStackOptions, ProcessVideoOptions, WindowOptions
+from rsvib_torch.options import ProcessVideoOptions, StackOptions
 from rsvib_torch.text import number_of, printable
 
 if TYPE_CHECKING:
@@ -26,11 +26,10 @@ if TYPE_CHECKING:
 
 
 _RESULTS = (*answers.OF_DETECTION, *answers.OF_WINDOWS, "before_after.png", "report.html")
-_PROCESSING = ("resume", "compression", "memory", "workers")
 
 
 @options
-class RunOptions(RestorationCommand, PixelSizeOptions, VerdictOptions):
+class RunCommand(RestoringCommand, PixelSizeOptions, VerdictOptions):
     """Options of ``run``."""
 
     out: Path = argument()
@@ -57,11 +56,32 @@ class RunOptions(RestorationCommand, PixelSizeOptions, VerdictOptions):
             },
         ),
     ]
-    windows: Annotated[Table, Given(WindowOptions, default="from the configuration")]
-    processing: Annotated[Table, Given(ProcessStackOptions, _PROCESSING)]
+
+    @cached_property
+    def restored(self) -> Path:
+        """The restored stack."""
+        output = self.output.removesuffix("/")
+        if self.moved and not self.video:
+            raise ValueError(f"--{next(iter(self.moved)).replace('_', '-')} goes with --video")
+        if self.video:
+            if output != "restored.tif":
+                raise ValueError(
+                    f"--video and --output {output} are two names for the restored stack; give one of them"
+                )
+            ending = io.split_range(self.frames)[0].suffix.lower()
+            output = f"restored{ending if ending in io.H264 else '.mkv'}"
+        if Path(output).name != output or output in ("", ".", ".."):
+            raise ValueError(f"--output must be a file name without a folder, got {output!r}")
+        return self.out / output
+
+    @property
+    def is_followed(self) -> bool:
+        """Whether a video of more than one window is processed from frame to frame."""
+        is_long_video = self.video and io.is_video(self.frames) and self.info.shape[0] > self.window
+        return bool(self.moved) or is_long_video
 
 
-def run(given: RunOptions) -> Answer:
+def run(given: RunCommand) -> Answer:
     """Detect the vibration, restore the frames, judge the result.
 
     Figures and, with --report, a page show both. Stacks of any length are processed in windows. If the restored frames
@@ -69,35 +89,34 @@ def run(given: RunOptions) -> Answer:
     current windows; --resume continues. With --video, the vibration of a video is followed frame by frame: --steady 1
     --border crop makes a shaky video steady.
     """
-    settings, frames, out, output = given.settings, given.frames, given.out, _name_of_output(given)
-    replaces = given.overwrite or "resume" in given.processing
-    answers.check_folder(out, _RESULTS, replaces, given.inputs, out / output)
-    current_output().work = stacks.work_folder(out / output)
-    print_notes(given.info, settings)
-    window = WindowOptions(**{**settings.stack, **given.windows}).window
-    # 1. Process windows, or a video of more than one window from frame to frame.
-    followed = bool(given.moved) or (given.video and io.is_video(frames) and given.info.shape[0] > window)
-    result = _process_video(given, out / output) if followed else _process(given, out / output, window)
+    settings, out, restored = given.settings, given.out, given.restored  # a mistake in settings needs no torch
+    answers.check_folder(out, _RESULTS, given.replaces, given.inputs, restored)
+    current_output().work = stacks.work_folder(restored)
+    given.print_notes()
+    # 1. The restored frames and their manifest.
+    result = _process_video(given) if given.is_followed else _process(given)
     stored, first = stacks.read_manifest(result.manifest), result.first
-    page = _video_page(given, out / output, stored) if first is None else _window_page(given, first, stored)
     # 2. Figure, tables and page.
+    page = _video_page(given, stored) if first is None else _window_page(given, first, stored)
     with whole_folder(out) as folder:
         drawn = []
         if len(page.frames):
             with working("drawing the frames"):
                 reports.save_figure(_comparison(page), folder / "before_after.png")
             drawn = ["before_after.png"]
-        names = [output, *drawn, "manifest.json"] if followed else [*drawn, output, "manifest.json"]
-        answer = _describe(folder, given, result, page, stored, names)
+        names = [restored.name, *drawn] if given.is_followed else [*drawn, restored.name]
+        answer, tables = _describe(folder, given, result, page, stored)
+        names += ["manifest.json", *tables]
+        if not given.video and io.is_video(given.frames) and result.restored < result.windows:
+            answer.next_steps.insert(0, answers.run_step(given.frames, out / "followed", settings.arguments))
         if given.report:
             pages = _write_page(folder, page, stored, answer)
             answers.check_folder(out, pages, overwrite=True, inputs=given.inputs)
             names = list(dict.fromkeys(pages + names))  # the page shows the curves of offsets.png as well
         elif result.restored:
             command = (current_output().command or "").replace(" --resume", "")
-            step = f"write a page with all figures:\n  {command} --resume --report"
-            answer.next_steps.insert(0, step)
-    if followed:
+            answer.next_steps.insert(0, f"write a page with all figures:\n  {command} --resume --report")
+    if given.is_followed:
         _describe_video(answer, stored, result)
     if given.overwrite:
         answers.remove_old(out, _RESULTS, names)
@@ -105,49 +124,31 @@ def run(given: RunOptions) -> Answer:
     return answer
 
 
-def _name_of_output(given: RunOptions) -> str:
-    """Name of the restored stack."""
-    output = given.output.removesuffix("/")
-    if given.moved and not given.video:
-        raise ValueError(f"--{next(iter(given.moved)).replace('_', '-')} goes with --video")
-    if given.video:
-        if output != "restored.tif":
-            raise ValueError(f"--video and --output {output} are two names for the restored stack; give one of them")
-        ending = io.split_range(given.frames)[0].suffix.lower()
-        output = f"restored{ending if ending in io.H264 else '.mkv'}"
-    if Path(output).name != output or output in ("", ".", ".."):
-        raise ValueError(f"--output must be a file name without a folder, got {output!r}")
-    return output
-
-
-def _process(given: RunOptions, restored: Path, window: int) -> stacks.StackReport:
+def _process(given: RunCommand) -> stacks.StackReport:
     """Process a stack in windows; the first one is computed again if it was complete before."""
-    options = given.of_stack | {"window": window, "force": given.force, "detection": given.settings.detection}
-    frames, timing, counts = given.frames, given.settings.timing, given.info.shape[0] > window
-    of_run = options | given.processing | {"manifest": given.out / "manifest.json"}
-    with working(f"restoring {frames.name}", counts=counts) as progress:
-        result = stacks.process_stack(frames, restored, timing, **of_run, progress=progress if counts else None)
-    if result.bad_frames:
-        warn(f"{number_of(result.bad_frames, 'frame')} could not be used: see manifest.json")
-    answers.note_lost(restored, result.not_kept)
-    if result.first is not None:
-        return result
-    options |= {name: value for name, value in given.processing.items() if name in ("memory", "workers")}
-    return replace(result, first=next(iter(stacks.iterate_stack(frames, timing, **options))))
+    of_run = given.of_stack | {"detection": given.settings.detection}
+    report = given.process(given.restored, of_run | {"manifest": given.out / "manifest.json"})
+    if report.bad_frames:
+        warn(f"{number_of(report.bad_frames, 'frame')} could not be used: see manifest.json")
+    if report.first is not None:
+        return report
+    of_run |= {"window": given.window, "force": given.force}
+    of_windows = {name: value for name, value in of_run.items() if name in fields_of(StackOptions)}
+    first = next(iter(stacks.iterate_stack(given.frames, given.settings.timing, **of_windows)))
+    return replace(report, first=first)
 
 
-def _process_video(given: RunOptions, restored: Path) -> stacks.StackReport:
+def _process_video(given: RunCommand) -> stacks.StackReport:
     """Process a video from frame to frame."""
     restoration = dict(given.of_stack["restoration"])
     if {**given.settings.restoration, **given.restoration}.get("saturation") in (None, "auto"):
         restoration.pop("saturation", None)  # that of integer formats
-    of_run = given.of_stack | {"restoration": restoration} | given.moved | given.windows | given.processing
-    of_run["manifest"] = given.out / "manifest.json"
+    of_run = given.of_stack | given.moved | {"restoration": restoration, "manifest": given.out / "manifest.json"}
     with working(f"restoring {given.frames.name}", counts=True) as progress:
-        return video.process_video(given.frames, restored, given.settings.timing, **of_run, progress=progress)
+        return video.process_video(given.frames, given.restored, given.settings.timing, **of_run, progress=progress)
 
 
-def _page(given: RunOptions, stored: stacks.StackManifest, **shown: Any) -> reports.Report:
+def _page(given: RunCommand, stored: stacks.StackManifest, **shown: Any) -> reports.Report:
     """The page of a run that shows some frames."""
     return reports.Report(
         title=printable(f"Vibration in {given.frames.name}"),
@@ -157,7 +158,7 @@ def _page(given: RunOptions, stored: stacks.StackManifest, **shown: Any) -> repo
     )
 
 
-def _window_page(given: RunOptions, first: stacks.WindowResult, stored: stacks.StackManifest) -> reports.Report:
+def _window_page(given: RunCommand, first: stacks.WindowResult, stored: stacks.StackManifest) -> reports.Report:
     """The page of the first window: all of its frames, or without a page one of them: of a joint image, the middle."""
     after, mosaic = first.frames.cpu(), given.of_stack["restoration"].get("mosaic")
     indices = first.indices or [index for index in first.window.written if index not in first.bad_frames]
@@ -180,7 +181,7 @@ def _window_page(given: RunOptions, first: stacks.WindowResult, stored: stacks.S
     return _page(given, stored, **shown)
 
 
-def _video_page(given: RunOptions, restored: Path, stored: stacks.StackManifest) -> reports.Report:
+def _video_page(given: RunCommand, stored: stacks.StackManifest) -> reports.Report:
     """The page of two frames near the begin of a video."""
     bad = stored.bad_frames
     usable = (number for number in range(given.info.shape[0] - 1) if not {str(number), str(number + 1)} & bad.keys())
@@ -190,33 +191,26 @@ def _video_page(given: RunOptions, restored: Path, stored: stacks.StackManifest)
     if stored.margins is not None:
         before = video.Margins(**stored.margins).cut(before)
     if any(record.frames == "restored" for record in stored.windows):
-        after = io.read_frames(restored, indices)
+        after = io.read_frames(given.restored, indices)
     return _page(given, stored, frames=before, restored=after, first=first or 0, timing=given.settings.timing)
 
 
 def _describe(
-    folder: Path,
-    given: RunOptions,
-    result: stacks.StackReport,
-    page: reports.Report,
-    stored: stacks.StackManifest,
-    names: list[str],
-) -> Answer:
-    """Write the tables and figures of one vibration of all frames, or of the windows; their names are added."""
+    folder: Path, given: RunCommand, result: stacks.StackReport, page: reports.Report, stored: stacks.StackManifest
+) -> tuple[Answer, list[str]]:
+    """The answer, and the names of the tables and figures of one vibration of all frames, or of the windows."""
     frames, found, title = given.frames, page.detection, f"Vibration in {given.frames.name}"
     if page.windows is None and found is not None and result.first is not None and result.first.error is None:
-        names += answers.write_detection(folder, found, page.timing, given.pixel_size)
+        names = answers.write_detection(folder, found, page.timing, given.pixel_size)
         answer = answers.stack_answer(frames, found, given.pixel_size)
         answer.results["Restoration"], answer.data["restoration"] = answers.restoration_of(result)
         answer.next_steps = answers.steps_after_detection(found, frames, given.settings)
     else:
-        names += answers.write_windows(folder, stored, given.pixel_size)
+        names = answers.write_windows(folder, stored, given.pixel_size)
         answer = Answer({title: stored.lines()[0]}, {"windows": stored.totals()})
         answer.reliable = answers.verdicts([record.detection for record in stored.windows])
         answer.results["Restoration"] = [result.summary(), *stored.lines()[1][1:]]
-    if not given.video and io.is_video(frames) and result.restored < result.windows:
-        answer.next_steps.insert(0, answers.run_step(frames, given.out / "followed", given.settings.arguments))
-    return answer
+    return answer, names
 
 
 def _describe_video(answer: Answer, stored: stacks.StackManifest, result: stacks.StackReport) -> None:

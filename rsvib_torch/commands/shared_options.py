@@ -5,23 +5,21 @@ import statistics
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from fractions import Fraction
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from rsvib_torch import frames as preparation
-from rsvib_torch import gyroscope, io
-from rsvib_torch import restoration as restore
+from rsvib_torch import gyroscope, io, stacks
 from rsvib_torch.checks.values import options
 from rsvib_torch.commands.flat_command import Given, argument, option
-from rsvib_torch.commands.terminal import note
+from rsvib_torch.commands.terminal import note, working
 from rsvib_torch.config import Config, read_config
 from rsvib_torch.files.atomic import check_outputs, check_writable
 from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.timing import SensorSection, SensorTiming
-from rsvib_torch.options import RestorationOptions, method_options
+from rsvib_torch.options import ProcessStackOptions, RestorationOptions, WindowOptions, method_options
 from rsvib_torch.text import AXES
 
 if TYPE_CHECKING:
@@ -36,28 +34,20 @@ _TIME_UNITS = {"": 1, "s": 1, "ms": 10**3, "us": 10**6, "µs": 10**6, "μs": 10*
 _LENGTH_UNITS = {"m": 1, "cm": 10**2, "mm": 10**3, "um": 10**6, "µm": 10**6, "μm": 10**6, "nm": 10**9}  # per metre
 
 
-def _with_unit(text: str, units: Mapping[str, int], expected: str) -> float:
+def _with_unit(units: Mapping[str, int], expected: str, text: str) -> float:
     """A number or a fraction with one of the units, which state how many of them are 1."""
-    unit = text.strip().lstrip("0123456789./eE+-")
+    stated = text.replace(" ", "")
+    unit = stated.lstrip("0123456789./eE+-")
     try:
-        return float(Fraction(text.strip().removesuffix(unit)) / units[unit])
+        return float(Fraction(stated.removesuffix(unit)) / units[unit])
     except (ValueError, ArithmeticError, KeyError) as error:
         raise typer.BadParameter(f"expected {expected}, got {text!r}") from error
 
 
-def seconds(text: str) -> float:
-    """A time in seconds: a number or a fraction, with or without a unit."""
-    return _with_unit(text, _TIME_UNITS, "a time such as 14.5us, 1/500 or 2e-5 (in s)")
-
-
-def metres(text: str) -> float:
-    """A length in metres: a number with a unit."""
-    return _with_unit(text.replace(" ", ""), _LENGTH_UNITS, "a length with its unit such as 12.5um or 0.3mm")
-
-
-def rate(text: str) -> float:
-    """Frames per second: a number or a fraction."""
-    return _with_unit(text, {"": 1}, "a number such as 29.97 or 30000/1001")
+# Values with a unit: a time in s, a length in m, and frames per second.
+seconds = partial(_with_unit, _TIME_UNITS, "a time such as 14.5us, 1/500 or 2e-5 (in s)")
+metres = partial(_with_unit, _LENGTH_UNITS, "a length with its unit such as 12.5um or 0.3mm")
+rate = partial(_with_unit, {"": 1}, "a number such as 29.97 or 30000/1001")
 
 
 def _axes(text: str) -> str:
@@ -135,7 +125,7 @@ class StackCommand(CameraOptions):
     """A command that reads a stack of frames."""
 
     frames: Path = argument()
-    """Stack of frames: TIFF, .npy, HDF5, video, or a folder of PNG, TIFF or JPEG files. NAME[100:200] are
+    """Stack of frames: TIFF, .npy, HDF5, video and others, or a folder of PNG, TIFF or JPEG files. NAME[100:200] are
     its frames 100 to 199, from the first of which times count."""
 
     device: DeviceName = "auto"
@@ -162,6 +152,11 @@ class StackCommand(CameraOptions):
             raise ValueError(f"{unknown}: give --full-scale, e.g. 4095 for 12 bits, or full_scale in [sensor]")
         return configured if stated is None else stated
 
+    def print_notes(self) -> None:
+        """Print what the file states about orientation, dropped frames and unequal intervals."""
+        for sentence in io.describe_stack(self.info, self.settings.timing):
+            note(sentence)
+
     @property
     def inputs(self) -> list[Path]:
         """Files that are read."""
@@ -177,31 +172,52 @@ class StackCommand(CameraOptions):
         return torch.device("cuda" if self.device != "cpu" and torch.cuda.is_available() else "cpu")
 
 
+_JOINT: Table = {
+    "text": "Number of neighbouring frames that are restored jointly, or 'all' for one image of all frames (of each "
+    "window).",
+    "kind": str,
+}
+_WINDOW: Table = {
+    "text": "Largest number of frames that are processed together; of restore --vibration all.",
+    "show_default": "from the configuration, or 8",
+}
+
+
 @options
-class RestorationCommand(StackCommand):
+class RestoringCommand(StackCommand):
     """A command that restores the frames with options of ``restore``."""
 
-    restoration: Annotated[
-        Table,
-        Given(
-            RestorationOptions,
-            default="from the configuration",
-            forms={
-                "joint": {
-                    "text": "Number of neighbouring frames that are restored jointly, or 'all' for one image of all "
-                    "frames (of each window).",
-                    "kind": str,
-                },
-            },
-        ),
-    ]
+    restoration: Annotated[Table, Given(RestorationOptions, default="from the configuration", forms={"joint": _JOINT})]
+    processing: Annotated[Table, Given(ProcessStackOptions, forms={"window": _WINDOW})]
     force: bool = False
     """Write the restored frames even if they are judged no better than the input."""
 
+    @property
+    def window(self) -> int:
+        """Largest number of frames that are processed together."""
+        return int((self.settings.stack | self.processing).get("window", WindowOptions().window))
+
+    @property
+    def replaces(self) -> bool:
+        """Whether results that exist may be replaced."""
+        return self.overwrite or "resume" in self.processing
+
     @cached_property
     def of_stack(self) -> Table:
-        """Options of the functions for stacks: full scale, device, and options of ``restore``."""
-        return {"full_scale": self.scale, "restoration": self._chosen(), "device": str(self.torch_device)}
+        """Options of the functions for stacks: those given, full scale, device, and options of ``restore``."""
+        device = str(self.torch_device)
+        return self.processing | {"full_scale": self.scale, "restoration": self._chosen(), "device": device}
+
+    def process(self, restored: Path, of_run: Table) -> "stacks.StackReport":
+        """Process the stack in windows, with the options of the command and those of the run."""
+        of_run = Table(window=self.window, force=self.force) | self.of_stack | of_run
+        counts = self.info.shape[0] > of_run["window"]
+        with working(f"restoring {self.frames.name}", counts=counts) as progress:
+            of_run["progress"] = progress if counts else None
+            report = stacks.process_stack(self.frames, restored, self.settings.timing, **of_run)
+        if report.not_kept:
+            note(f"{restored}: not kept from the input: {', '.join(report.not_kept)}")
+        return report
 
     def _chosen(self) -> Table:
         """Options of ``restore``: those of the configuration file, replaced by those of the command line."""
@@ -216,15 +232,12 @@ class RestorationCommand(StackCommand):
                 raise ValueError(f"--joint must be 'all' or a number of frames, got {given['joint']!r}")
             given["joint"] = given["joint"] == "all" or int(given["joint"])
         options |= given
-        checked = RestorationOptions(**options)
+        RestorationOptions(**options)  # raises an error for wrong ones
         if options.get("saturation") == "auto":
             del options["saturation"]
         level = options.get("saturation", full_scale)  # None: no pixels are saturated
         if info.is_integer and full_scale is not None and level is not None:  # of frames whose full scale is 1
             options["saturation"] = level / full_scale
-        if checked.mosaic is not None:
-            preparation.check_mosaic(checked.mosaic, info.shape)
-        restore.check_optics(checked.optics)
         return options
 
 

@@ -13,15 +13,14 @@ from rsvib_torch.checks.values import options
 from rsvib_torch.commands import answers
 from rsvib_torch.commands import shared_options as shared
 from rsvib_torch.commands.flat_command import Given, argument, option
-from rsvib_torch.commands.terminal import Answer, current_output, note, warn, working
+from rsvib_torch.commands.terminal import Answer, current_output, warn, working
 from rsvib_torch.files.atomic import check_writable, whole_folder
 from rsvib_torch.files.reading import Table
-from rsvib_torch.options import FreeMotionOptions, MotionUnit, ProcessStackOptions
+from rsvib_torch.options import FreeMotionOptions, MotionUnit
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from rsvib_torch.config import Config
     from rsvib_torch.io.stack_info import StackInfo
 
 
@@ -33,25 +32,19 @@ def load(given: shared.StackCommand) -> tuple[Tensor, rsvib_torch.SensorTiming]:
     stacks.check_stack_fits(given.info, on_gpu=given.torch_device.type != "cpu")
     with working(f"reading {given.frames}"):
         frames = io.read_stack(given.frames, full_scale=given.scale)
-    print_notes(given.info, given.settings)
+    given.print_notes()
     return frames.to(given.torch_device), io.timing_from_first_frame(given.settings.timing, given.info)
 
 
-def print_notes(info: io.StackInfo, config: Config) -> None:
-    """Print what the file states about orientation, dropped frames and unequal intervals."""
-    for sentence in io.describe_stack(info, config.timing):
-        note(sentence)
-
-
 @options
-class DetectOptions(shared.StackCommand, shared.PixelSizeOptions, shared.VerdictOptions):
+class DetectCommand(shared.StackCommand, shared.PixelSizeOptions, shared.VerdictOptions):
     """Options of ``detect``."""
 
     out: Path = option(...)
     """Folder for vibration.json, tables (tones, offsets, spectrum) and figures."""
 
 
-def detect(given: DetectOptions) -> Answer:
+def detect(given: DetectCommand) -> Answer:
     """Detect the vibration in a stack of frames.
 
     The vibration is modelled as sinusoids of constant amplitude and frequency in all frames. For those that change, and
@@ -72,7 +65,7 @@ def detect(given: DetectOptions) -> Answer:
 
 
 @options
-class MotionOptions(shared.StackCommand, shared.VerdictOptions):
+class MotionCommand(shared.StackCommand, shared.VerdictOptions):
     """Options of ``motion``."""
 
     out: Path = option(...)
@@ -80,7 +73,7 @@ class MotionOptions(shared.StackCommand, shared.VerdictOptions):
     detection: Annotated[Table, Given(FreeMotionOptions, ("knot_rows", "search"))]
 
 
-def motion(given: MotionOptions) -> Answer:
+def motion(given: MotionCommand) -> Answer:
     """Detect motion that is not a steady vibration.
 
     To restore frames with the CSV file: rsvib restore --motion FILE --unit px --offset 0.
@@ -104,7 +97,7 @@ def motion(given: MotionOptions) -> Answer:
 
 
 @options
-class RestoreOptions(shared.RestorationCommand):
+class RestoreCommand(shared.RestoringCommand):
     """Options of ``restore``."""
 
     restored: Path = argument()
@@ -126,19 +119,6 @@ class RestoreOptions(shared.RestorationCommand):
     ignore: list[str] | None = option(None, metavar="ROWS[,COLUMNS]", show_default="all rows count")
     """With a gyroscope: rows of the frames, or a part of them, that do not count in the comparison with it, for example
     400: for a dashboard below row 400, or :60,500: for a sign in a corner; may be given several times."""
-    processing: Annotated[
-        Table,
-        Given(
-            ProcessStackOptions,
-            ("memory", "workers", "resume"),
-            forms={
-                "window": {
-                    "text": "With --motion, largest number of frames that are restored and judged together.",
-                    "show_default": "from the configuration, or 8",
-                }
-            },
-        ),
-    ]
 
     @property
     def manifest(self) -> Path:
@@ -146,54 +126,47 @@ class RestoreOptions(shared.RestorationCommand):
         return self.restored.with_name(f"{self.restored.name}.manifest.json")
 
 
-def restore(given: RestoreOptions) -> Answer:
+def restore(given: RestoreCommand) -> Answer:
     """Restore a stack of frames with a detected vibration or a recorded motion.
 
     The offset of a recorded motion is stated (--offset); that of a gyroscope is found by the frames: rates that do not
     explain them are refused. If the restored frames are judged no better than the input, the input is written
     unchanged. --force restores in both cases.
     """
-    settings, frames, vibration = given.settings, given.frames, given.vibration
+    settings, vibration = given.settings, given.vibration
     outputs = [*io.stack_files(given.restored), given.manifest]
-    replaces = given.overwrite or "resume" in given.processing
-    shared.check_new(outputs, replaces, [*given.inputs, vibration, given.motion, given.lens_profile])
+    shared.check_new(outputs, given.replaces, [*given.inputs, vibration, given.motion, given.lens_profile])
     current_output().work = stacks.work_folder(given.restored)
     check_writable(given.restored, folder=not given.restored.suffix)
-    info, scale, chosen = given.info, given.scale, given.of_stack["restoration"]
-    of_run = given.of_stack | {"force": given.force} | given.processing
     # 1. The vibration of all frames, or the motion on the clock of the frames.
+    info, of_run = given.info, Table()
     if vibration is not None and given.motion is None:
         of_recordings = ("offset", "unit", "ignore", "focal_length", "lens_profile")
         if useless := [name for name in of_recordings if getattr(given, name) not in (None, ())]:
             option = useless[0].replace("_", "-")
             raise ValueError(f"--{option} is for --motion, a recording; --vibration is that of the frames themselves")
         detected = reports.read_vibration(vibration, io.timing_from_first_frame(settings.timing, info))
-        stacks.check_stack_fits(info, chosen, on_gpu=given.torch_device.type != "cpu")
-        print_notes(info, settings)
+        stacks.check_stack_fits(info, given.of_stack["restoration"], on_gpu=given.torch_device.type != "cpu")
+        given.print_notes()
         of_run |= {"given": [detected], "window": max(2, info.shape[0])}
         answer = Answer({"Vibration": [detected.summary()]}, {"detection": answers.detection_data(detected)})
     elif given.motion is not None and vibration is None:
         answer = Answer({}, {"alignment": None})
-        of_run["motion"] = _motion_of_frames(given, given.motion, replace(info, full_scale=scale), answer)
-        of_run["window"] = given.processing.get("window", settings.stack.get("window", 8))
+        of_run["motion"] = _motion_of_frames(given, given.motion, replace(info, full_scale=given.scale), answer)
     else:
         raise ValueError("give --vibration FILE, or --motion FILE of a recording")
     # 2. Restoration in windows.
-    counts = info.shape[0] > of_run["window"]
-    with working(f"restoring {frames.name}", counts=counts) as progress:
-        of_run["progress"] = progress if counts else None
-        run = stacks.process_stack(frames, given.restored, settings.timing, **of_run)
-    answers.note_lost(given.restored, run.not_kept)
+    run = given.process(given.restored, of_run)
     answer.results["Restoration"], answer.data["restoration"] = answers.restoration_of(run)
     answer.files += [given.restored, given.manifest]
     return answer
 
 
-def _motion_of_frames(given: RestoreOptions, path: Path, info: StackInfo, answer: Answer) -> rsvib_torch.FreeMotion:
+def _motion_of_frames(given: RestoreCommand, path: Path, info: StackInfo, answer: Answer) -> rsvib_torch.FreeMotion:
     """A recorded motion on the clock of the frames, which is stated or estimated."""
     recorded, timing = _recorded(given, path), given.settings.timing
     ignore = stacks.mask_of_regions(given.ignore or (), (info.shape[-2], info.shape[-1]))
-    print_notes(info, given.settings)
+    given.print_notes()
     if isinstance(recorded, rsvib_torch.FreeMotion):
         if given.offset is None:
             raise ValueError(f"--unit {given.unit} needs --offset: the time of the recording when frame 0 begins, in s")
@@ -214,7 +187,7 @@ def _motion_of_frames(given: RestoreOptions, path: Path, info: StackInfo, answer
     return found.motion
 
 
-def _recorded(given: RestoreOptions, path: Path) -> rsvib_torch.FreeMotion | rsvib_torch.AngularRates:
+def _recorded(given: RestoreCommand, path: Path) -> rsvib_torch.FreeMotion | rsvib_torch.AngularRates:
     """The motion of a CSV file, or the rates of a gyroscope."""
     if given.unit is not None:
         if given.lens_profile is not None or given.ignore:

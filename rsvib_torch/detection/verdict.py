@@ -110,7 +110,7 @@ def _reasons_against_stack(stack: Table, timing: RowTiming, max_tones: float, le
     """Reasons against each axis of one stack, from the numbers of its compared quantities."""
     by_rows, axes, of_all = "bands" not in stack, len(stack["amplitude"]), []
     if stack["measured"] < _MIN_MEASURED:
-        what = "the rows of some frames" if by_rows else f"{stack['bands']:g} row bands"
+        what = "the rows that frames have in common" if by_rows else f"{stack['bands']:g} row bands"
         of_all = [Reason("rows_not_registered", None, stack["measured"], _MIN_MEASURED, {"what": what})]
     if by_rows:
         of_all += exposure_reasons(timing, *stack["blur"])

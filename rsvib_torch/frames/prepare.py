@@ -416,8 +416,8 @@ def grey_frames(
     for stack, first in _repeated(images).nonzero().tolist():
         raise ValueError(
             f"frames {first} and {first + 1}{of_stack(stack)} are identical: one of them is a copy (video converters "
-            "repeat frames), and its time is wrong; remove copies and state the times of the others in "
-            "frame_start_times"
+            "repeat frames), and its time is wrong; use frames without copies, e.g. NAME[0:100] of a file, or follow a "
+            "video from frame to frame (process_video, rsvib run --video)"
         )
     # all channels show the same displacement; the pattern of a colour mosaic does not move with the scene
     images = images.mean(2) if images.shape[2] > 1 else without_mosaic(images[:, :, 0])

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rsvib_torch.checks.values import needed_package
+from rsvib_torch.files.reading import size_text
 from rsvib_torch.io.frame_reader import FrameReader, check_held, contiguous_reader, readable_stack
 from rsvib_torch.io.stack_info import StackInfo, attributes_of, info_of_array
 from rsvib_torch.numerics.tables import Array
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
     from h5py import Dataset, File, Group
 
 _NAME = "frames"  # of the dataset that is written
+# bytes, and in stacks: HDF5 decodes a chunk as a whole, and a chunk may exceed the stack, as that of a recording which
+# ended early. One of 400 MB around a stack of 16 KB took 4 s and 400 MB until the first frame was read
+_LARGEST_CHUNK, _CHUNK_RATIO = 2**26, 8
 _MAX_MEMBERS = 10_000  # groups and datasets; each takes about 0.1 ms
 
 _h5py = partial(needed_package, "h5py", "reading and writing HDF5", "formats")
@@ -62,6 +66,9 @@ def open_hdf5(path: Path) -> FrameReader:
             info = info_of_array(shape, dataset.dtype, dict(dataset.attrs))
             check_held(info.shape[0] * info.frame_bytes, min(dataset.id.get_storage_size(), path.stat().st_size))
             chunk = math.prod(dataset.chunks or (1,)) * int(dataset.dtype.itemsize)
+            if chunk > max(_LARGEST_CHUNK, _CHUNK_RATIO * info.shape[0] * info.frame_bytes):
+                stack = f"a stack of {size_text(info.shape[0] * info.frame_bytes)}"
+                raise ValueError(f"a chunk of {size_text(chunk)} holds {stack}; store it in chunks of a frame")
             name, sides = dataset.name, dataset.chunks or (1, *shape[1:])
         # 2. Frames. HDF5 keeps decoded chunks of several frames until the last of their frames was read; one chunk
         # besides: measured with gzip, lzf, shuffle and without compression.

@@ -29,6 +29,7 @@ class StackFormat:
         "uint8", "int8", "uint16", "int16", "uint32", "int32", "float16", "float32", "float64",
     )  # fmt: skip
     check: Callable[[Path, StackInfo], None] | None = None  # raises an error if a stack cannot be written to a path
+    uncompressed: bool = False  # whether files have the size of their pixels (without a value of ``compression``)
     kind: Kind = "file"  # a "folder" may contain other files
     compressions: tuple[str, ...] = ()  # values of ``compression`` besides None
     keeps: tuple[str, ...] = ()  # attributes of ``StackInfo`` that are stored besides the pixels
@@ -39,15 +40,23 @@ _KEPT_BY_PNG = ("full_scale", "orientation")
 
 # The order is that of error messages.
 _STACK_FORMATS = (
-    StackFormat("npy", (".npy",), open_npy, write_npy, check=check_array),
-    StackFormat("hdf5", (".h5", ".hdf5", ".hdf"), open_hdf5, write_hdf5, check=check_array, keeps=_KEPT),
+    StackFormat("npy", (".npy",), open_npy, write_npy, check=check_array, uncompressed=True),
+    StackFormat(
+        "hdf5", (".h5", ".hdf5", ".hdf"), open_hdf5, write_hdf5, check=check_array, uncompressed=True, keeps=_KEPT
+    ),
     StackFormat("jpeg", (".jpg", ".jpeg"), open_images),
     StackFormat("png", (".png",), open_images, write_images, ("uint8", "uint16"), check_images, keeps=_KEPT_BY_PNG),
     StackFormat(
         "image folder", ("",), open_images, write_images, check=check_images, kind="folder", keeps=_KEPT_BY_PNG
     ),
     StackFormat(
-        "tiff", (".tif", ".tiff"), open_tiff, write_tiff, compressions=("zlib", "lzma"), keeps=(*_KEPT, "metadata")
+        "tiff",
+        (".tif", ".tiff"),
+        open_tiff,
+        write_tiff,
+        uncompressed=True,
+        compressions=("zlib", "lzma"),
+        keeps=(*_KEPT, "metadata"),
     ),
     StackFormat("FFV1 video", FFV1, VideoReader, write_video, ("uint8", "uint16"), check_video, keeps=_KEPT),
     StackFormat("H.264 video", H264, VideoReader, write_video, check=check_video, keeps=_KEPT),

@@ -77,11 +77,9 @@ def read_stack_info(path: PathLike) -> StackInfo:
 def read_stack(path: PathLike | Sequence[PathLike], *, full_scale: float | None = None) -> Tensor:
     """Read a stack of frames from a file, or from several files one after another.
 
-    The ending selects the format: TIFF (``.tif``, ``.tiff``; also BigTIFF and compressed), ``.npy`` with (H, W),
-    (T, H, W) or (T, C, H, W), HDF5 (``.h5``, ``.hdf5``),
-    video (``.mp4``, ``.mov``, ``.mkv``, ``.avi`` and others; grey or RGB, with 8 to 16 bits), a single ``.png`` or
-    ``.jpg``, or a folder of PNG, TIFF or JPEG files in natural order (frame9 before frame10). Channels keep the order
-    of the file, RGB or RGBA. Frames have the stored rows and columns: an orientation that the file states for display
+    The ending selects the format: TIFF, ``.npy``, HDF5, video, images and others, all of which docs/stacks.md lists; a
+    folder has PNG, TIFF or JPEG files in natural order (frame9 before frame10). Channels keep the order of the file,
+    RGB or RGBA. Frames have the stored rows and columns: an orientation that the file states for display
     (``read_stack_info(path).orientation``) is not applied. ``"clip.mp4[100:200]"`` are frames 100 to 199.
 
     Integers are divided by the full scale: ``full_scale`` if given, else the value stated in the file, else 255 for

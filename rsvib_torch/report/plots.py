@@ -108,16 +108,6 @@ def _plot_axes(
         panel.legend(**_LEGEND, ncols=2)
 
 
-def _marker(colour: str, reliable: bool) -> Table:
-    """Style of points: hollow if they are not reliable."""
-    return {"color": colour, "marker": "o", "linestyle": "none", "markerfacecolor": colour if reliable else "white"}
-
-
-def _error_bar(std: Tensor) -> float:
-    """Two standard deviations; 0 if they are not known."""
-    return 2 * float(std) if math.isfinite(float(std)) else 0.0
-
-
 def _symbol(label: str, **style: Any) -> Line2D:
     """An entry of a legend: a point, or a line if its style is given."""
     return Line2D([], [], label=label, **{"marker": "o", "linewidth": 0, **style})
@@ -252,9 +242,10 @@ def windows_figure(
                 reliable = bool(found.reliable[axis])
                 for tone in found.vibration.amplitude[axis].nonzero()[:, 0].tolist():
                     value = float(getattr(found.vibration, quantity)[axis, tone])
-                    error = _error_bar(getattr(found.std, quantity)[axis, tone]) if reliable else 0.0
-                    style = _marker(_AXIS_COLOURS[name] if tone == 0 else _GREY, reliable)
-                    panel.errorbar(time, value, error, markersize=5, capsize=2, **style)
+                    std, colour = getattr(found.std, quantity)[axis, tone], _AXIS_COLOURS[name] if tone == 0 else _GREY
+                    error = 2 * float(std) if reliable and math.isfinite(float(std)) else 0.0
+                    style = {"color": colour, "marker": "o", "markerfacecolor": colour if reliable else "white"}
+                    panel.errorbar(time, value, error, linestyle="none", markersize=5, capsize=2, **style)
                     reliable_values += [value - error, value + error] if reliable else []
             if reliable_values:
                 low, high = min(reliable_values), max(reliable_values)

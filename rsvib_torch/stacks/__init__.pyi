@@ -1,4 +1,3 @@
-from .job import WindowResult as WindowResult
 from .manifest import StackManifest as StackManifest
 from .manifest import read_manifest as read_manifest
 from .memory import check_stack_fits as check_stack_fits
@@ -13,4 +12,5 @@ from .window_restoration import RestoredFrames as RestoredFrames
 from .window_restoration import restore_trusted as restore_trusted
 from .window_restoration import without_data as without_data
 from .windows import Window as Window
+from .windows import WindowResult as WindowResult
 from .windows import cut_windows as cut_windows

@@ -1,8 +1,7 @@
-"""The computation of one window: reading its frames, detection, restoration, and the record of the result."""
+"""What a run over a stack is: its settings and windows, and the computation of one window from its frames."""
 
-import os
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from contextlib import closing, suppress
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,12 +12,10 @@ from torch import Tensor
 
 from rsvib_torch.checks.arguments import PathLike
 from rsvib_torch.checks.values import check_choice
-from rsvib_torch.detection import MotionDetection, detect_motion, detect_vibration
 from rsvib_torch.frames.pixels import check_mosaic, colour_frames, enlarged
 from rsvib_torch.io import full_scale as scales
 from rsvib_torch.io.frame_reader import FrameError, FrameReader
 from rsvib_torch.io.frame_times import exposure_times, timing_of_stack
-from rsvib_torch.io.full_scale import counts_to_frames
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.io.stack_reading import open_stack, read_stack_info
 from rsvib_torch.motion.detected_vibration import DetectedVibration
@@ -33,59 +30,17 @@ from rsvib_torch.options import (
     VibrationOptions,
 )
 from rsvib_torch.restoration.restore import check_optics
-from rsvib_torch.results.presentation import Summarised, plain_values
 from rsvib_torch.stacks.memory import windows_at_once
 from rsvib_torch.stacks.window_restoration import (
-    RestoredFrames,
-    equivalent_tones,
     frame_fault,
-    may_change,
-    reliable_motion,
+    known_motion,
+    measured_motion,
     restore_trusted,
-    tones_of_given,
     without_data,
 )
-from rsvib_torch.stacks.windows import Window, WindowRecord, cut_windows, window_timing
+from rsvib_torch.stacks.windows import StoredWindow, Window, WindowRecord, WindowResult, cut_windows, window_timing
 
-# Least number of knots of a motion in the rows of a frame. With 8, half of the axes of small frames (192 rows, one to
-# six periods in a frame) were refused, which are reliable with 16 and 24.
-_KNOTS = 16
 WindowFrames = list[Array | str]  # pixels as stored, or why a frame cannot be read
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class WindowResult(Summarised):
-    """One window of a stack, restored."""
-
-    window: Window
-    indices: tuple[int, ...]  # of ``frames`` in the stack; empty if all frames were restored jointly as one image
-    frames: Tensor  # with full scale 1, (T, H, W) or (T, C, H, W): restored, or as taken
-    # with the time origin at the window's first frame; None if it failed. With a ``motion``, its ``equivalent_tones``
-    detection: DetectedVibration | None
-    restoration: RestoredFrames | None  # None without a detection
-    error: str | None  # why detection or restoration failed
-    bad_frames: Mapping[int, str]  # frames of ``window.written`` that could not be used; they are not in ``frames``
-    motion: FreeMotion | None = None  # of a vibration that changes, in place of tones; axes that are not reliable rest
-
-    @property
-    def restored(self) -> bool:
-        """Whether the frames are restored."""
-        return self.restoration is not None and self.restoration.restored
-
-    def summary(self) -> str:
-        """Frames of the window, its vibration, and what was restored."""
-        state = "restored" if self.restored else "unchanged"
-        lines = [f"window {self.window.index}, frames {self.window.first} … {self.window.last}: {state}"]
-        if self.detection is not None:
-            lines.append(self.detection.summary())
-        if self.restoration is not None:
-            lines += map(str, self.restoration.left_alone)
-            lines += [] if self.restoration.verdict is None else [self.restoration.verdict.sentence]
-        lines += [] if self.error is None else [self.error]
-        return "\n".join([*lines, *(f"frame {index}: {fault}" for index, fault in self.bad_frames.items())])
-
-
-StoredWindow = tuple[list[Array], WindowRecord]  # frames as they are stored, and the record
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +55,16 @@ class StackJob:
     # of every window, the motion to use instead of a detection, from its first frame on; None: it has none
     given: Sequence[DetectedVibration | FreeMotion | None] | None = None
 
+    @cached_property
+    def chosen(self) -> RestorationOptions:
+        """All options of ``restore``."""
+        return RestorationOptions(**(self.options.restoration or {}))
+
+    @property
+    def is_joined(self) -> bool:
+        """Whether one image is made of a window."""
+        return self.chosen.joint is True
+
     def open(self) -> FrameReader:
         """Open the stack, which must not have changed."""
         reader = open_stack(self.source)
@@ -107,16 +72,6 @@ class StackJob:
             reader.close()
             raise ValueError(f"{self.source} has changed since it was first opened; start again")
         return reader
-
-    @cached_property
-    def chosen(self) -> RestorationOptions:
-        """All options of ``restore``; ``joint=True`` makes one image of a window."""
-        return RestorationOptions(**(self.options.restoration or {}))
-
-    def _unchanged(self, frames: Tensor) -> Tensor:
-        """Frames that were not restored, in the shape of restored ones."""
-        mosaic = self.chosen.mosaic
-        return enlarged(frames if mosaic is None else colour_frames(frames, mosaic), self.chosen.scale)
 
     def content(self, out: StackInfo, timing: SensorTiming) -> StackInfo:
         """The output ``out`` with full scale, times and frame rate; ``timing`` is that of the caller."""
@@ -140,18 +95,21 @@ class StackJob:
         timing = window_timing(self.timing, window, list(usable))
         try:
             # 2. Their motion.
-            motion, tones = self._motion(window, taken, timing)
-            if motion is None:
-                return replace(result, error="no detection was given for this window")
-            free = reliable_motion(motion)[0] if isinstance(motion, MotionDetection) else motion
-            result = replace(result, detection=tones, motion=free if tones and isinstance(free, FreeMotion) else None)
+            if self.given is None:
+                moved = measured_motion(taken, timing, options.detection or {})
+            else:
+                given = self.given[window.index]
+                if given is None:
+                    return replace(result, error="no detection was given for this window")
+                moved = known_motion(given, taken, timing, is_recorded=options.motion is not None)
+            result = replace(result, detection=moved.tones, motion=moved.free)
             if options.restoration is None:
                 return result
-            # 3. The frames without it.
+            # 3. The frames without it, and whether they are better.
             restoration = restore_trusted(
                 taken,
                 timing,
-                motion,
+                moved.motion,
                 self.chosen,
                 force=options.force,
                 first_frames=len(kept) if len(kept) > 1 and not self.chosen.joint else None,
@@ -163,33 +121,45 @@ class StackJob:
         if not restoration.restored:
             return result
         # 4. Those that are written, or one image of all.
-        if self.chosen.joint is True:
-            result, frames = replace(result, indices=()), restoration.frames
+        frames = restoration.frames
+        if self.is_joined:
+            result = replace(result, indices=())
         else:
-            taken, frames = taken[: len(kept)], restoration.frames[: len(kept)]
+            taken, frames = taken[: len(kept)], frames[: len(kept)]
         return replace(result, frames=frames if self.info.nodata is None else without_data(frames, taken))
 
-    def _motion(
-        self, window: Window, taken: Tensor, timing: SensorTiming
-    ) -> tuple[DetectedVibration | MotionDetection | FreeMotion | None, DetectedVibration | None]:
-        """The motion in the frames ``taken`` of a window, and its tones or those that stand for it.
+    def compute_stored(self, window: Window, pixels: WindowFrames) -> StoredWindow:
+        """``compute``, and the frames as they are stored: those that were not restored are unchanged.
 
-        The motion is None if it should be given; there are no tones of a recorded one.
+        A frame that cannot be read is stored as NaN, or 0 for integers.
         """
-        rows = taken.shape[int(timing.scan_axis)]
-        if self.given is not None:
-            given = self.given[window.index]
-            if not isinstance(given, FreeMotion) or self.options.motion is not None:  # recorded
-                return given, given if isinstance(given, DetectedVibration) else None
-            return given, tones_of_given(given, timing, len(taken), rows)
-        detected = detect_vibration(taken, timing, **self.options.detection or {})
-        if self.options.detection or not may_change(detected, len(taken)):
-            return detected, detected
-        with suppress(ValueError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
-            found = detect_motion(taken, timing, knot_rows=min(24, max(4, rows // _KNOTS)))
-            if found.reliable.sum() > detected.reliable.sum():
-                return found, equivalent_tones(found, detected)
-        return detected, detected
+        result, dtype = self.compute(window, pixels), np.dtype(self.info.dtype)
+
+        def counts(images: Tensor) -> Array:
+            return scales.frames_to_counts(images, dtype, self.options.full_scale, self.info.nodata)
+
+        def as_taken(index: int) -> Array:
+            frame = pixels[index - window.frames.start]
+            if isinstance(frame, str):
+                frame = np.full(self.info.shape[1:], np.nan if dtype.kind == "f" else 0, dtype)
+            if self.chosen.scale == 1 and self.chosen.mosaic is None:
+                return frame
+            return counts(self._unchanged(self._as_taken(frame[None]))[0])  # the shape of restored ones
+
+        if result.restored and self.is_joined:
+            frames = list(counts(result.frames))
+        else:
+            restored = dict(zip(result.indices, result.frames, strict=True)) if result.restored else {}
+            middle = window.written[window.kept // 2]
+            written = [middle] if self.is_joined else window.written
+            frames = [counts(restored[index]) if index in restored else as_taken(index) for index in written]
+        record, first = WindowRecord.of(result, self.timing, len(frames)), result if window.index == 0 else None
+        return StoredWindow(record, np.ascontiguousarray(np.stack(frames)), first)  # channels may be stored last
+
+    def _unchanged(self, frames: Tensor) -> Tensor:
+        """Frames that were not restored, in the shape of restored ones."""
+        mosaic = self.chosen.mosaic
+        return enlarged(frames if mosaic is None else colour_frames(frames, mosaic), self.chosen.scale)
 
     def _images(self, frames: Sequence[Array]) -> Tensor:
         """Frames as stored as (T, H, W) or (T, C, H, W), full scale 1."""
@@ -198,54 +168,7 @@ class StackJob:
         return self._as_taken(np.stack(frames)).to(self.options.device)
 
     def _as_taken(self, stored: Array) -> Tensor:
-        return counts_to_frames(stored, self.options.full_scale, str(self.source), self.info.nodata)
-
-    def stored(self, result: WindowResult, pixels: WindowFrames) -> StoredWindow:
-        """The frames of a result as they are stored: frames that were not restored are unchanged.
-
-        A frame that cannot be read is stored as NaN, or 0 for integers.
-        """
-        dtype = np.dtype(self.info.dtype)
-
-        def counts(images: Tensor) -> Array:
-            return scales.frames_to_counts(images, dtype, self.options.full_scale, self.info.nodata)
-
-        def as_taken(index: int) -> Array:
-            frame = pixels[index - result.window.frames.start]
-            if isinstance(frame, str):
-                frame = np.full(self.info.shape[1:], np.nan if dtype.kind == "f" else 0, dtype)
-            if self.chosen.scale == 1 and self.chosen.mosaic is None:
-                return frame
-            return counts(self._unchanged(self._as_taken(frame[None]))[0])  # the shape of restored ones
-
-        if result.restored and not result.indices:  # one image of all frames
-            frames = list(counts(result.frames))
-        else:
-            restored = dict(zip(result.indices, result.frames, strict=True)) if result.restored else {}
-            written = list(result.window.written)
-            written = [written[len(written) // 2]] if self.chosen.joint is True else written
-            frames = [counts(restored[index]) if index in restored else as_taken(index) for index in written]
-        return frames, self.record(result, len(frames))
-
-    def record(self, result: WindowResult, written: int) -> WindowRecord:
-        """The record of a result of which ``written`` frames were written."""
-        window, restoration = result.window, result.restoration
-        verdict = None if restoration is None else restoration.verdict
-        return WindowRecord(
-            window=window.index,
-            first=window.first,
-            last=window.last,
-            start_time=float(self.timing.frame_starts(window.first + 1)[-1]),
-            written=written,
-            frames="restored" if result.restored else "as taken",
-            detection=None if result.detection is None else DetectedVibration.of(result.detection).to("cpu"),
-            outcome=None if verdict is None else verdict.overall,
-            predicted_gain=None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),
-            bad_frames={str(index): reason for index, reason in result.bad_frames.items()},
-            left_alone=() if restoration is None else restoration.left_alone,
-            error=result.error,
-            motion=None if result.motion is None else result.motion.to("cpu"),
-        )
+        return scales.counts_to_frames(stored, self.options.full_scale, str(self.source), self.info.nodata)
 
 
 def stored_frame(read: Callable[[int], Array], index: int) -> Array | str:
@@ -310,7 +233,6 @@ def plan_job(
     check_choice("device", options.device.partition(":")[0], ("auto", "cpu", "cuda"))
     default = "cuda" if torch.cuda.is_available() else "cpu"
     device = default if options.device == "auto" else options.device
-    on_gpu = device != "cpu"
     restoration = (options.restoration or {}) if isinstance(options, StackOptions) else None
     of_job = {"full_scale": full_scale, "device": device, "restoration": restoration, "progress": None}
     stated = ProcessStackOptions(**{**vars(options), **of_job})
@@ -322,13 +244,7 @@ def plan_job(
     joint, most = job.chosen.joint, min(stated.window, info.shape[0])
     if joint is not True and joint > most:
         raise ValueError(f"joint must be at most {most}, the number of frames of a window, got {joint}")
-    if options.workers is not None:
-        most = options.workers
-    elif on_gpu:
-        most = 1
-    else:
-        most = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     at_once = windows_at_once(
-        info, stated.window, memory=options.memory, most=most, restoration=restoration, on_gpu=on_gpu
+        info, stated.window, restoration, memory=options.memory, workers=options.workers, on_gpu=device != "cpu"
     )
     return job, windows, at_once

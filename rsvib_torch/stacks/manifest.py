@@ -14,11 +14,13 @@ from statistics import median, stdev
 import numpy as np
 
 from rsvib_torch.checks.arguments import checks_arguments
+from rsvib_torch.checks.values import fields_of
 from rsvib_torch.files.reading import Table
 from rsvib_torch.io.stack_info import split_range
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.options import StackOptions
 from rsvib_torch.results.presentation import (
     AXIS_NAMES,
     Result,
@@ -122,18 +124,17 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
         windows, found = self.windows, self._tones
         gains = [record.predicted_gain for record in windows if record.predicted_gain is not None]
         names = AXIS_NAMES[: max((one.vibration.num_axes for one in found if one is not None), default=2)]
-        unchanged: dict[str, Table] = {name: {} for name in names}
-        for record in windows:
-            for reason in record.left_alone:
-                if reason.axis in unchanged:
-                    unchanged[reason.axis][str(record.window)] = reason.to_dict()
+        unchanged = [(reason.axis, record.window, reason) for record in windows for reason in record.left_alone]
         return {
             "windows": len(windows),
             "restored": sum(record.frames == "restored" for record in windows),
             "outcomes": dict(Counter(record.outcome for record in windows if record.outcome is not None)),
             "predicted_gain_db": {"lowest": min(gains), "highest": max(gains)} if gains else None,
             "tones": {name: _tones_over_windows(found, axis) for axis, name in enumerate(names)},
-            "left_alone": unchanged,
+            "left_alone": {
+                name: {str(window): reason.to_dict() for axis, window, reason in unchanged if axis == name}
+                for name in names
+            },
             "errors": {str(record.window): record.error for record in windows if record.error is not None},
             "bad_frames": self.bad_frames,
         }
@@ -142,12 +143,10 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
         """The totals as lines of text: about the vibration, and about the restoration."""
         data = self.totals()
         # All windows were measured, and nothing else than missing tones is stated against any axis.
-        codes = {
-            "failed" if one is None else one.codes((axis,))
+        is_still = bool(self.windows) and all(
+            one is not None and all(one.codes((axis,)) == "no_tone" for axis in range(one.vibration.num_axes))
             for one in self._tones
-            for axis in range(2 if one is None else one.vibration.num_axes)
-        }
-        is_still = codes == {"no_tone"}
+        )
         vibration = self._tone_lines() if self.gyroscope is None else _gyroscope_lines(self.gyroscope)
         if is_still:
             text = "no window has a significant tone"
@@ -170,33 +169,33 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
 
         If the vibration changes in windows, it has the amplitudes in the first and in the last one.
         """
+        tones = {name: of_axis["tones"] for name, of_axis in self.totals()["tones"].items()}
         rows, count, changing = [], len(self.windows), self._changing
-        for name, of_axis in self.totals()["tones"].items():
-            for tone in of_axis["tones"]:
-                texts = [
-                    measured_text(tone[name], tone[f"{name}_spread"] or None) for name in ("amplitude", "frequency")
-                ]
+        for axis, of_axis in tones.items():
+            for tone in of_axis:
+                amplitude, frequency = (
+                    measured_text(tone[quantity], tone[f"{quantity}_spread"] or None)
+                    for quantity in ("amplitude", "frequency")
+                )
                 if changing and tone["windows"] > 1:
-                    texts[0] = f"{tone['first']:.4g} … {tone['last']:.4g}"
-                rows.append([name, f"{tone['windows']} of {count}", *texts])
-            rows += [] if of_axis["tones"] else [[name, f"0 of {count}", "", ""]]
-        table = text_table(["axis", "reliable windows", "amplitude (px)", "frequency (Hz)"], rows)
-        spread = "median ± standard deviation over the windows"
-        if not changing:
-            return [table, spread]
-        which = "all" if changing == count else f"{changing} of {count}"
-        text = f"no steady tones explain {which} windows, whose motion was therefore measured without tones"
-        refused: dict[object, str] = {
-            record.window: "; ".join(map(str, record.detection.assumptions))
-            for record in self.windows
-            if record.detection is not None and record.motion is not None and record.detection.assumptions
-        }
-        return [
-            table,
-            f"amplitude: in the first and the last window; frequency: {spread}",
-            wrapped(f"{text}; amplitudes are those of a tone of the same rms displacement"),
-            *(wrapped(f"assumed in {text}") for text in _first_of(refused)),
-        ]
+                    amplitude = f"{tone['first']:.4g} … {tone['last']:.4g}"
+                rows.append([axis, f"{tone['windows']} of {count}", amplitude, frequency])
+            rows += [] if of_axis else [[axis, f"0 of {count}", "", ""]]
+        lines = [text_table(["axis", "reliable windows", "amplitude (px)", "frequency (Hz)"], rows)]
+        if any(tones.values()):
+            spread = "median ± standard deviation over the windows"
+            lines.append(f"amplitude: in the first and the last window; frequency: {spread}" if changing else spread)
+        if changing:
+            which = "all" if changing == count else f"{changing} of {count}"
+            measured = f"no steady tones explain {which} windows, whose motion was therefore measured without tones"
+            lines.append(wrapped(f"{measured}; amplitudes are those of a tone of the same rms displacement"))
+            refused: dict[object, str] = {
+                record.window: "; ".join(map(str, record.detection.assumptions))
+                for record in self.windows
+                if record.detection is not None and record.motion is not None and record.detection.assumptions
+            }
+            lines += [wrapped(f"assumed in {note}") for note in _first_of(refused)]
+        return lines
 
     def _lines_of_video(self) -> list[str]:
         """Axes of a video that were restored although they are not reliable, and the first assumption."""
@@ -260,24 +259,19 @@ _SAME_TONE = 0.03  # of the frequency, or 4 std: a tone of the next window close
 def _tones_over_windows(found: Sequence[DetectedVibration | None], axis: int) -> Table:
     """Number of windows in which an axis is reliable, and median and spread of its tones over them, strongest first.
 
-    The tones of a window continue those of nearly the same frequency in the windows before, the nearest ones first.
+    The tones of a window, the strongest first, continue those of nearly the same frequency in the windows before.
     """
     reliable = [one for one in found if one is not None and axis < one.vibration.num_axes and bool(one.reliable[axis])]
     tones: list[list[tuple[float, float]]] = []  # (amplitude, frequency) in the windows of each tone
     for one in reliable:
-        columns = (
-            values[axis].tolist() for values in (one.vibration.amplitude, one.vibration.frequency, one.std.frequency)
-        )
-        new = [(a, f, max(_SAME_TONE * f, 4 * s)) for a, f, s in zip(*columns, strict=True) if a > 0]
-        steps = ((abs(f - tone[-1][1]), i, j) for i, (_, f, _) in enumerate(new) for j, tone in enumerate(tones))
-        pairs: dict[int, int] = {}  # number of the tone that each one of this window continues
-        for step, i, j in sorted(steps):
-            if i not in pairs and j not in pairs.values() and step <= new[i][2]:
-                pairs[i] = j
-        for i, (amplitude, frequency, _) in enumerate(new):
-            if i not in pairs:
-                tones.append([])
-            tones[pairs.get(i, -1)].append((amplitude, frequency))
+        columns = (one.vibration.amplitude, one.vibration.frequency, one.std.frequency)
+        earlier = list(tones)
+        for amplitude, frequency, std in zip(*(values[axis].tolist() for values in columns), strict=True):
+            distances = [abs(frequency - tone[-1][1]) for tone in earlier]
+            if amplitude > 0 and distances and min(distances) <= max(_SAME_TONE * frequency, 4 * std):
+                earlier.pop(distances.index(min(distances))).append((amplitude, frequency))
+            elif amplitude > 0:
+                tones.append([(amplitude, frequency)])
     described: list[Table] = []
     for tone in tones:
         described.append({"windows": len(tone), "first": tone[0][0], "last": tone[-1][0]})
@@ -307,7 +301,7 @@ def fingerprint(path: Path) -> Table:
 
 
 # options on which the result depends
-_SETTINGS = ("full_scale", "window", "detection", "restoration", "force", "device")
+_SETTINGS = tuple(name for name in fields_of(StackOptions) if name not in ("memory", "workers"))
 
 
 def manifest_header(job: StackJob, output: str | None, compression: str | None) -> Table:

@@ -1,6 +1,7 @@
 """Memory planning: how many windows can be processed at once in the available memory."""
 
 import ctypes
+import os
 import re
 from contextlib import suppress
 from functools import partial
@@ -76,16 +77,20 @@ def memory_needed(
 def windows_at_once(
     info: StackInfo,
     window: int,
-    *,
-    memory: str | float | None,
-    most: int,
     restoration: OptionTable,
+    *,
+    memory: str | float | None = None,
+    workers: int | None = None,
     on_gpu: bool = False,
 ) -> int:
-    """Number of windows that can be processed at once, at most ``most``, within the memory of the machine.
+    """Number of windows that can be processed at once within the memory of the machine.
 
-    The error about too little memory states the required size and the largest window that fits.
+    It is at most ``workers``: by default the number of processors, or 1 on a GPU. The error about too little memory
+    states the required size and the largest window that fits.
     """
+    if workers is None:
+        processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        workers = 1 if on_gpu else processors
     limit = memory_limit(memory)
     needed = partial(memory_needed, info, restoration=restoration, on_gpu=on_gpu)
     process, one = needed(window, count=0), needed(window)
@@ -104,7 +109,7 @@ def windows_at_once(
             f"memory of {size_text(limit)}{origin} is too little: a window of {frames} frames of {info.shape[-2]} x "
             f"{info.shape[-1]} px takes about {size_text(one)}; allow more (--memory), or {remedy}"
         )
-    return int(min(most, count))
+    return int(min(workers, count))
 
 
 def check_stack_fits(info: StackInfo, restoration: OptionTable = None, *, on_gpu: bool = False) -> None:

@@ -1,31 +1,31 @@
-"""Processing of stacks of any length: ``iterate_stack``, ``detect_stack`` and ``process_stack``."""
+"""Processing of stacks of any length: ``iterate_stack``, ``detect_stack`` and ``process_stack``.
+
+One loop: the frames of the source are read in windows; the motion of each window is detected, its frames are restored
+and the result is judged (``StackJob.compute``, in threads); finished windows are stored in a folder (``RunFolder``)
+and become the output and its manifest (``FileRun``) when all of them are there.
+"""
 
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
-import numpy as np
 import torch
 
 from rsvib_torch.checks.arguments import PathLike
 from rsvib_torch.execution.parallel import in_threads
 from rsvib_torch.files.atomic import check_outputs, check_writable
-from rsvib_torch.files.reading import Table
 from rsvib_torch.frames.entry_points import file_options, source_options
 from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, stack_files, write_frames
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import DetectStackOptions, ProcessStackOptions, Progress, StackOptions
-from rsvib_torch.stacks.job import StackJob, StoredWindow, WindowFrames, WindowResult, plan_job, read_windows
+from rsvib_torch.stacks.job import StackJob, WindowFrames, plan_job, read_windows
 from rsvib_torch.stacks.manifest import StackManifest, manifest_header
 from rsvib_torch.stacks.memory import share_one_heap
-from rsvib_torch.stacks.run_folder import RunFolder, StackReport, check_space, run_to_file
-from rsvib_torch.stacks.windows import Window
+from rsvib_torch.stacks.run_folder import FileRun, StackReport, check_space
+from rsvib_torch.stacks.windows import Window, WindowRecord, WindowResult
 
 _Result = TypeVar("_Result")
-_UNCOMPRESSED = ("npy", "hdf5", "tiff")  # formats whose files have the size of their pixels
 _MAX_INITIAL_FAILURES = 8  # windows; a run stops if all windows up to this number fail
 
 
@@ -55,7 +55,7 @@ def iterate_stack(source: PathLike, timing: SensorTiming, options: StackOptions)
         (1, 2, 3) [110.0, 90.0]
     """
     job, windows, at_once = plan_job(source, timing, options)
-    yield from _computed(job, windows, lambda result, _: result, at_once=at_once)
+    yield from _in_threads(job, job.compute, windows, at_once)
 
 
 @file_options(DetectStackOptions)
@@ -74,8 +74,14 @@ def detect_stack(source: PathLike, sink: PathLike, timing: SensorTiming, options
     job, windows, at_once = plan_job(source, timing, options)
     check_outputs([sink], stack_files(source))
     check_writable(Path(sink))
-    results = _computed(job, windows, lambda result, _: (list[Array](), job.record(result, 0)), at_once=at_once)
-    records = (record for _, record in _watched(results, windows, windows, [], options.progress))
+    records: list[WindowRecord] = []
+    count = _counter(options.progress, windows, windows)
+    with closing(_in_threads(job, job.compute, windows, at_once)) as results:
+        for result in results:
+            records.append(WindowRecord.of(result, job.timing, written=0))
+            if _all_failed(records, len(windows)):
+                raise ValueError(records[0].error)
+            count(result.window.kept)
     StackManifest(**manifest_header(job, None, None), windows=tuple(records)).save(sink)
 
 
@@ -123,91 +129,66 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
         >>> rsv.read_stack(f"{folder}/restored.npy").shape == frames.shape
         True
     """
-    sink = Path(sink)
-    compression = options.compression
+    # 1. What is computed, and what is written.
+    sink, compression = Path(sink), options.compression
     job, windows, at_once = plan_job(source, timing, options)
-    joined = job.chosen.joint is True
-    out = job.info.with_frames(len(windows) if joined else job.info.shape[0])
-    out = out.restored_as(job.chosen.scale, job.chosen.mosaic)
-    out = job.content(out, timing)
+    out = job.info.with_frames(len(windows) if job.is_joined else job.info.shape[0])
+    out = job.content(out.restored_as(job.chosen.scale, job.chosen.mosaic), timing)
     form = check_info_target(sink, out, compression, check_folder=False)
-    first: WindowResult | None = None
-
-    def finish(result: WindowResult, pixels: WindowFrames) -> StoredWindow:
-        nonlocal first
-        if result.window.index == 0:
-            first = result
-        return job.stored(result, pixels)
-
-    def compute(folder: RunFolder) -> Table:
-        remaining = [window for window in windows if window.index not in folder]
-        count = len(remaining) if joined else sum(window.kept for window in remaining)
+    run = FileRun(sink, options, manifest_header(job, sink.name, compression), stack_files(source))
+    # 2. A complete output is not computed again.
+    finished = run.finished()
+    if finished is not None:
+        return finished
+    with run.folder() as folder:
+        records = folder.records()
+        missing, resumed = [window for window in windows if window.index not in folder], len(records)
         # the finished windows and the output are on the disk together, until the output is complete
-        count += out.shape[0] if compression is None and form.name in _UNCOMPRESSED else 0
-        check_space(sink, count * out.frame_bytes)
-        results = _computed(job, remaining, finish, at_once=at_once)
-        errors = [record.error for record in folder.records()]
-        for frames, record in _watched(results, windows, remaining, errors, options.progress, folder.remove):
-            # channels may be stored last
-            folder.add(record, array=np.ascontiguousarray(np.stack(frames)) if frames else None)
-        return {"not_kept": metadata_not_kept(job.info, sink, out.shape)}
-
-    def stored(folder: RunFolder) -> Iterator[Array]:
-        for name in folder.files():
-            with folder.open(name) as file:
-                yield from np.load(file, allow_pickle=False)
-
-    def write(folder: RunFolder) -> None:
-        write_frames(form, sink, out, stored(folder), compression)
-
-    report = run_to_file(
-        sink,
-        options,
-        manifest_header(job, sink.name, compression),
-        inputs=stack_files(source),
-        compute=compute,
-        write=write,
-    )
-    return replace(report, first=first)
+        stored = len(missing) if job.is_joined else sum(window.kept for window in missing)
+        stored += out.shape[0] if compression is None and form.uncompressed else 0
+        check_space(sink, stored * out.frame_bytes)
+        # 3. The windows that are not in the folder: read, detected, restored, judged, stored.
+        first: WindowResult | None = None
+        count = _counter(options.progress, windows, missing)
+        with closing(_in_threads(job, job.compute_stored, missing, at_once)) as results:
+            for window, made in zip(missing, results, strict=True):
+                records.append(made.record)
+                first = first or made.result
+                if _all_failed(records, len(windows)):
+                    folder.remove()
+                    raise ValueError(records[0].error)
+                folder.add(made.record, array=made.frames)
+                count(window.kept)
+        # 4. The output from the windows in the folder, and the manifest.
+        with run.writing(folder, not_kept=metadata_not_kept(job.info, sink, out.shape)) as manifest:
+            write_frames(form, sink, out, folder.frames(), compression)
+    return run.report(manifest, resumed, first)
 
 
-def _computed(
-    job: StackJob, windows: Sequence[Window], finish: Callable[[WindowResult, WindowFrames], _Result], *, at_once: int
+def _in_threads(
+    job: StackJob, compute: Callable[[Window, WindowFrames], _Result], windows: Sequence[Window], at_once: int
 ) -> Generator[_Result, None, None]:
-    """Compute windows, in order; ``finish`` gets a result and its frames in the thread that computed it."""
-
-    def compute(window: Window, pixels: WindowFrames) -> _Result:
-        return finish(job.compute(window, pixels), pixels)
-
+    """Results of ``compute`` of windows and their frames, in order; later windows are read and computed meanwhile."""
     share_one_heap()
     # Sums of floats depend on the number of threads: results must not depend on how many windows are computed at once.
     threads = torch.get_num_threads() if all(window.alone for window in windows) else 1
     return in_threads(compute, read_windows(job, windows), at_once=at_once, threads=threads)
 
 
-def _watched(
-    results: Generator[StoredWindow, None, None],
-    windows: Sequence[Window],
-    remaining: Sequence[Window],
-    errors: list[str | None],
-    progress: Progress,
-    fail: Callable[[], None] = lambda: None,
-) -> Iterator[StoredWindow]:
-    """The results of the remaining windows, while their frames are counted.
+def _all_failed(records: Sequence[WindowRecord], count: int) -> bool:
+    """Whether detection has failed in every window so far: in eight, or in all of fewer (``count``)."""
+    return len(records) >= min(_MAX_INITIAL_FAILURES, count) and all(record.error for record in records)
 
-    If detection has failed in every window so far (``errors`` before these), ``fail`` is called, and it is an error.
-    """
-    total = windows[-1].last + 1
-    done = total - sum(window.kept for window in remaining)
-    if progress is not None:
-        progress(done, total)
-    with closing(results):
-        for window, stored in zip(remaining, results, strict=True):
-            errors.append(stored[1].error)
-            if len(errors) >= min(_MAX_INITIAL_FAILURES, len(windows)) and all(errors):
-                fail()
-                raise ValueError(errors[0])
-            yield stored
-            done += window.kept
-            if progress is not None:
-                progress(done, total)
+
+def _counter(progress: Progress, windows: Sequence[Window], missing: Sequence[Window]) -> Callable[[int], None]:
+    """A function that reports the progress after a number of further frames; those of finished windows are counted."""
+    done, total = 0, windows[-1].last + 1
+
+    def count(frames: int) -> None:
+        nonlocal done
+        done += frames
+        if progress is not None:
+            progress(done, total)
+
+    count(total - sum(window.kept for window in missing))
+    return count

@@ -1,50 +1,40 @@
 """A run that writes an output from windows, and is resumed if it was interrupted.
 
 Finished windows are in a folder beside the output: files of pixels, and a file with the record and the hashes of these
-files, which is written when they are on the disk. It begins with a hash of itself, whose key are the settings of the
-run: a window of another run, and one of which any file was changed, is not finished, and computed again. Files are
-opened relative to the open folder, and only new files are written: a link in the place of the folder or of a file is
-never followed, and nothing that others made is changed.
+files, which is written when they are on the disk. The key of its own hash are the settings of the run: a window of
+another run, and one of which any file was changed, is not finished, and computed again.
 """
 
 import errno
-import fcntl
-import hashlib
 import json
 import os
 import re
-import secrets
 import shutil
-import stat
 import time
-import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack, closing, suppress
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import IO, Literal
+from typing import Any
 
 import numpy as np
 
 from rsvib_torch.checks.arguments import check_fields
 from rsvib_torch.files import atomic
 from rsvib_torch.files.atomic import check_outputs, nearest_folder, sync
+from rsvib_torch.files.locked_folder import LockedFolder, key_of
 from rsvib_torch.files.reading import Table, size_text
 from rsvib_torch.io.stack_writing import stack_files
 from rsvib_torch.numerics.tables import Array
-from rsvib_torch.options import RunOptions
+from rsvib_torch.options import FileRunOptions
 from rsvib_torch.results.presentation import Summarised, decode, plain_values
-from rsvib_torch.stacks.job import WindowResult
 from rsvib_torch.stacks.manifest import StackManifest, read_manifest
-from rsvib_torch.stacks.windows import WindowRecord
+from rsvib_torch.stacks.windows import WindowRecord, WindowResult
 from rsvib_torch.text import number_of, one_line
 
 _SETTINGS = "settings.json"
 _RECORD = re.compile(r"\d{6,}\.json")
 _NAMES = re.compile(rf"{re.escape(_SETTINGS)}|\d{{6,}}\.(json|npy|mkv|mp4|mov|m4v)")  # of the files that a run makes
-_SAFELY = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # opening a named pipe must not wait for another process
-_blake2b = partial(hashlib.blake2b, digest_size=16)
 
 
 def work_folder(sink: Path) -> Path:
@@ -70,68 +60,25 @@ def check_space(path: Path, needed: int) -> None:
         raise OSError(f"{path}: {text}")
 
 
-class RunFolder:
-    """The work folder of a run, locked until it is closed.
+class RunFolder(LockedFolder):
+    """The finished windows of a run.
 
-    A run is resumed only if its ``header`` is unchanged: input, settings and versions. A folder that no run has made,
-    or in which another run writes, is refused.
+    A run is resumed only if its ``header`` is unchanged: input, settings and versions.
     """
 
     def __init__(self, sink: Path, header: Mapping[str, object], *, resume: bool) -> None:
-        self.sink, self.path, self._above = sink, work_folder(sink), nearest_folder(sink)
+        super().__init__(work_folder(sink), sink, _NAMES)
         self._finished: dict[int, tuple[WindowRecord, list[str]]] = {}  # record and names of the files of windows
-        self._key = _blake2b(json.dumps(header, sort_keys=True).encode()).digest()
-        atomic.make_folder(self.path.parent)
-        with ExitStack() as opened:
-            try:
-                with suppress(FileExistsError):
-                    self.path.mkdir(0o700)
-                    sync(self.path.parent)
-                self._folder = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | _SAFELY)
-                opened.callback(os.close, self._folder)
-                self._lock()
-            except (FileNotFoundError, BlockingIOError) as error:
-                raise BlockingIOError(f"cannot write {self.sink}: another run is writing it") from error
-            except OSError as error:
-                if error.errno not in (errno.ELOOP, errno.ENOTDIR):
-                    raise
-                raise self._refusal("it is a link" if self.path.is_symlink() else "it is not a folder") from error
-            self._find_windows(header, resume=resume)
-            self._opened = opened.pop_all()
-
-    def _lock(self) -> None:
-        """Lock the folder, which must be that of this user; a ``BlockingIOError`` if another run uses it."""
-        if os.fstat(self._folder).st_uid != os.geteuid():
-            raise self._refusal("it belongs to another user")
+        self._key = key_of(header)
         try:
-            fcntl.flock(self._folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS):  # as those of some clusters
-                raise
-            text = f"the file system has no locks ({error.strerror}): start no other run with this output"
-            warnings.warn(f"{self.path}: {text}", stacklevel=2)
-        if not self._has_its_name():
-            raise BlockingIOError  # another run has just ended
-
-    def _has_its_name(self) -> bool:
-        with suppress(FileNotFoundError):
-            return os.path.samestat(os.lstat(self.path), os.fstat(self._folder))
-        return False
-
-    def _refusal(self, reason: str, name: str = "") -> FileExistsError:
-        return FileExistsError(
-            f"cannot write {self.sink}: {self.path / name} was not made by a run, {reason}; move it elsewhere, or "
-            f"delete {self.path} to start over"
-        )
+            self._find_windows(header, resume=resume)
+        except BaseException:
+            super().close()
+            raise
 
     def _find_windows(self, header: Mapping[str, object], *, resume: bool) -> None:
-        """Find the finished windows; an error if the folder has other files than those of a run, or of another run."""
-        names = sorted(os.listdir(self._folder))
-        for name in names:
-            status = os.stat(name, dir_fd=self._folder, follow_symlinks=False)
-            if not (_NAMES.fullmatch(name) and stat.S_ISREG(status.st_mode)):
-                raise self._refusal("it has another name than files of a run, or is no regular file", name)
-        stored, records = self._content(_SETTINGS), list(filter(_RECORD.fullmatch, names))
+        """Find the finished windows; an error if they are not to be continued, or are those of other settings."""
+        stored, records = self.read_table(_SETTINGS), list(filter(_RECORD.fullmatch, self.names))
         if records and not resume:
             raise FileExistsError(
                 f"{self.sink}: a run was interrupted here after {len(records)} windows; resume it (--resume), or "
@@ -141,53 +88,19 @@ class RunFolder:
         if difference:
             raise ValueError(f"{self.sink}: cannot resume: {difference}; delete {self.path} to start over")
         for name in records:
-            entry = self._content(name, self._key)
+            entry = self.read_table(name, self._key)
             with suppress(OSError):  # a file is missing, or cannot be read
-                if entry is not None and all(self._digest(file) == digest for file, digest in entry["files"].items()):
+                if entry is not None and all(self.digest(file) == digest for file, digest in entry["files"].items()):
                     record = decode(WindowRecord, entry["record"], name)
                     if name == f"{record.window:06d}.json":
                         self._finished[record.window] = record, list(entry["files"])
         if stored != header:
-            self._write(_SETTINGS, header)
-
-    def open(self, name: str, mode: Literal["rb", "x+b"] = "rb") -> IO[bytes]:
-        """Open a file of the folder, wherever the folder is now, and never through a link."""
-        return open(name, mode, opener=lambda name, flags: os.open(name, flags | _SAFELY, 0o600, dir_fd=self._folder))
-
-    def _write(self, name: str, content: Mapping[str, object], key: bytes = b"") -> None:
-        """Write a table with its hash; it is on the disk when the function returns."""
-        body = json.dumps(content).encode()
-        with self.create(name) as file:
-            file.write(_blake2b(body, key=key).hexdigest().encode() + b" " + body)
-            file.flush()
-            os.fsync(file.fileno())
-        os.fsync(self._folder)
-
-    def _content(self, name: str, key: bytes = b"") -> Table | None:
-        """The table in a file; None if the file is not as it was written, or with another key."""
-        with suppress(OSError), self.open(name) as file:
-            digest, _, body = file.read().partition(b" ")
-            if digest == _blake2b(body, key=key).hexdigest().encode():
-                content: Table = json.loads(body)
-                return content
-        return None
-
-    def _digest(self, name: str, *, synchronised: bool = False) -> str:
-        with self.open(name) as file:
-            if synchronised:
-                os.fsync(file.fileno())
-            return hashlib.file_digest(file, _blake2b).hexdigest()  # type: ignore[arg-type]
-
-    def create(self, name: str) -> IO[bytes]:
-        """A new file of a window, whose name begins with the number of the window in six digits."""
-        with suppress(FileNotFoundError):
-            os.unlink(name, dir_fd=self._folder)
-        return self.open(name, "x+b")
+            self.write_table(_SETTINGS, header)
 
     def add(self, record: WindowRecord, names: Sequence[str] = (), array: Array | None = None) -> None:
         """Enter the record of a window with its closed files, and an array, which becomes the last of them.
 
-        It is on the disk when the function returns.
+        Their names begin with the number of the window in six digits. It is on the disk when the function returns.
         """
         names = list(names)
         if array is not None:
@@ -195,9 +108,9 @@ class RunFolder:
             with self.create(names[-1]) as file:
                 np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(array))
                 file.write(array.data)  # errors of np.save do not contain the reason
-        digests = {name: self._digest(name, synchronised=True) for name in names}
+        digests = {name: self.digest(name, synchronised=True) for name in names}
         content = {"record": plain_values(record), "files": digests}
-        self._write(f"{record.window:06d}.json", content, self._key)
+        self.write_table(f"{record.window:06d}.json", content, self._key)
         self._finished[record.window] = record, names
 
     def __contains__(self, window: int) -> bool:
@@ -216,63 +129,40 @@ class RunFolder:
         """Names of the files of the finished windows in order."""
         return [name for window in sorted(self._finished) for name in self._finished[window][1]]
 
-    def remove(self) -> None:
-        """Remove the folder, and the empty folders above it that were created for it.
+    def frames(self) -> Iterator[Array]:
+        """Frames of the finished windows in order, from the files of arrays."""
+        for name in self.files():
+            with self.open(name) as file:
+                yield from np.load(file, allow_pickle=False)
 
-        It is renamed first: if the process is killed meanwhile, ``temporary_folder`` removes the rest later.
-        """
-        hidden = self.path.with_name(f".{self.sink.name}.{secrets.token_hex(4)}{atomic.PART}")
+    def remove(self) -> None:
+        """Remove the folder with its windows."""
         self._finished.clear()
-        if self._has_its_name():
-            self.path.rename(hidden)
-            sync(hidden.parent)
-            shutil.rmtree(hidden, ignore_errors=True)
-        with suppress(OSError):  # folders that others use
-            folder = self.path.absolute().parent
-            while folder != self._above:
-                folder.rmdir()
-                folder = folder.parent
+        super().remove()
 
     def close(self) -> None:
         """Release the folder; it is removed if it contains no finished window."""
-        with self._opened:
+        try:
             if not self._finished:
                 self.remove()
+        finally:
+            super().close()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StackReport(Summarised):
-    """Summary of a run.
+    """Summary of a run."""
 
-    Attributes:
-        frames: Number of frames written, including those of an interrupted run that was resumed.
-        windows: Number of windows of the stack.
-        restored: Number of windows whose frames were restored.
-        failed: Number of windows in which detection or restoration failed.
-        bad_frames: Number of frames that could not be used.
-        resumed: Number of windows that were complete before.
-        seconds: Duration of the run.
-        first: Result of the first window, if it was computed in this process.
-        manifest: Path of the manifest.
-        not_kept: Metadata of the input that the output does not contain.
-
-    Example:
-        >>> import rsvib_torch as rsv
-        >>> report = rsv.process_stack("frames.tif", "restored.tif", timing)  # doctest: +SKIP
-        >>> report.frames, report.windows, report.restored, report.failed  # doctest: +SKIP
-        (200, 28, 28, 0)
-    """
-
-    frames: int
-    windows: int
-    restored: int
-    failed: int
-    bad_frames: int
-    resumed: int
-    seconds: float
-    first: WindowResult | None
-    manifest: Path
-    not_kept: tuple[str, ...]
+    frames: int  # number of frames written, including those of an interrupted run that was resumed
+    windows: int  # number of windows of the stack
+    restored: int  # number of windows whose frames were restored
+    failed: int  # number of windows in which detection or restoration failed
+    bad_frames: int  # number of frames that could not be used
+    resumed: int  # number of windows that were complete before
+    seconds: float  # duration of the run
+    first: WindowResult | None  # of the first window, if it was computed in this process
+    manifest: Path  # path of the manifest
+    not_kept: tuple[str, ...]  # metadata of the input that the output does not contain
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -292,26 +182,57 @@ class StackReport(Summarised):
         return "\n".join(lines)
 
 
-def run_to_file(
-    sink: Path,
-    options: RunOptions,
-    header: Table,
-    *,
-    inputs: Iterable[Path],
-    compute: Callable[[RunFolder], Table],
-    write: Callable[[RunFolder], None],
-) -> StackReport:
-    """Compute the windows of a run that are not finished, and write the output and its manifest; neither is an input.
+class FileRun:
+    """A run that writes an output and its manifest; neither is an input.
 
-    ``compute`` adds the missing windows to the folder and returns further fields of the manifest; ``write`` writes the
-    output from the folder.
+    Its steps are ``finished``, ``folder``, ``writing`` and ``report``.
     """
-    start = time.perf_counter()
-    header = json.loads(json.dumps(header))  # lists instead of tuples, as in files
-    path = sink.with_name(f"{sink.name}.manifest.json") if options.manifest is None else Path(options.manifest)
-    check_outputs([*stack_files(sink), work_folder(sink), path], inputs)
 
-    def report(manifest: StackManifest, resumed: int) -> StackReport:
+    def __init__(self, sink: Path, options: FileRunOptions, header: Table, inputs: Iterable[Path]) -> None:
+        self._start, self.sink, self._resume = time.perf_counter(), sink, options.resume
+        self.header: Table = json.loads(json.dumps(header))  # lists instead of tuples, as in files
+        self.manifest = Path(options.manifest or sink.with_name(f"{sink.name}.manifest.json"))
+        check_outputs([*stack_files(sink), work_folder(sink), self.manifest], inputs)
+
+    def finished(self) -> StackReport | None:
+        """The summary of a run to be resumed that is complete; an error if it is one with other settings."""
+        if not self._resume or os.path.lexists(work_folder(self.sink)):
+            return None
+        if not (self.sink.exists() and self.manifest.exists()):
+            return None
+        manifest = read_manifest(self.manifest)
+        difference = _difference({name: getattr(manifest, name) for name in self.header}, self.header)
+        if difference:
+            raise ValueError(
+                f"{self.sink}: cannot resume: {difference}; resume with the settings of before, or write another output"
+            )
+        for written in (self.sink, self.manifest):
+            atomic.remove_abandoned(written)
+        return self.report(manifest, len(manifest.windows))
+
+    @contextmanager
+    def folder(self) -> Iterator[RunFolder]:
+        """The folder of the finished windows, which errors of a full disk in the block state."""
+        opened = closing(RunFolder(self.sink, self.header, resume=self._resume))
+        with opened as folder, atomic.full_disk_named(self.sink, folder.kept):
+            yield folder
+
+    @contextmanager
+    def writing(self, folder: RunFolder, **stated: Any) -> Iterator[StackManifest]:
+        """Write the manifest, which ``stated`` fields belong to, after the block, which writes the output.
+
+        The folder is removed when both are on the disk.
+        """
+        atomic.make_folder(self.manifest.parent)
+        manifest = StackManifest(**self.header, **stated, windows=tuple(folder.records()))
+        with atomic.whole_file(self.manifest) as part:
+            manifest.save(part)
+            yield manifest
+        sync(self.manifest.absolute().parent)  # the temporary folder is gone as well
+        folder.remove()
+
+    def report(self, manifest: StackManifest, resumed: int, first: WindowResult | None = None) -> StackReport:
+        """The summary of the run, of which ``resumed`` windows were complete before."""
         records = manifest.windows
         return StackReport(
             frames=sum(record.written for record in records),
@@ -320,30 +241,8 @@ def run_to_file(
             failed=sum(record.error is not None for record in records),
             bad_frames=len(manifest.bad_frames),
             resumed=resumed,
-            seconds=time.perf_counter() - start,
-            first=None,
-            manifest=path,
+            seconds=time.perf_counter() - self._start,
+            first=first,
+            manifest=self.manifest,
             not_kept=manifest.not_kept,
         )
-
-    if options.resume and not work_folder(sink).exists() and sink.exists() and path.exists():
-        complete = read_manifest(path)
-        difference = _difference({name: getattr(complete, name) for name in header}, header)
-        if difference:
-            raise ValueError(
-                f"{sink}: cannot resume: {difference}; resume with the settings of before, or write another output"
-            )
-        for written in (sink, path):
-            atomic.remove_abandoned(written)
-        return report(complete, len(complete.windows))
-    with closing(RunFolder(sink, header, resume=options.resume)) as folder, atomic.full_disk_named(sink, folder.kept):
-        resumed = len(folder.records())
-        results = compute(folder)
-        atomic.make_folder(path.parent)
-        manifest = StackManifest(**header, **results, windows=tuple(folder.records()))
-        with atomic.whole_file(path) as part:
-            manifest.save(part)
-            write(folder)
-        sync(path.absolute().parent)  # the temporary folder is gone as well
-        folder.remove()
-        return report(manifest, resumed)

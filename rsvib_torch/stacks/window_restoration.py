@@ -1,18 +1,20 @@
-"""Restoration of the frames of one window, with a check of each frame and a verdict; vibration that changes.
+"""One window: which of its frames can be used, how they move, their restoration, and whether that helps.
 
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from rsvib_torch.checks.values import MAX_NUMBER, beyond_full_scale
-from rsvib_torch.detection import MotionDetection
+from rsvib_torch.detection import MotionDetection, detect_motion, detect_vibration
 from rsvib_torch.detection.shapes.free import vibration_in_place_of
 from rsvib_torch.frames.prepare import constant_frame, prepare_frames
 from rsvib_torch.imaging.sensor_model import sharpened
@@ -29,6 +31,150 @@ from rsvib_torch.restoration.judge import judge_prepared
 from rsvib_torch.restoration.restore import check_optics, restore_prepared, unchanged_frames, warn_of_mosaic
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
+
+# --- Frames ---
+
+
+def frame_fault(frame: Array | str, index: int, full_scale: float | None, nodata: float | None) -> str | None:
+    """Why a frame as stored, or the error of reading it, cannot be used; None if it can be."""
+    if isinstance(frame, str):
+        return frame
+    is_float = frame.dtype.kind == "f"
+    valued = frame if nodata is None else frame[frame != frame.dtype.type(nodata)]
+    valid = (valued.size - (int(np.isnan(valued).sum()) if is_float else 0)) / frame.size
+    if valid < 0.1:
+        return f"frame {index} has only {valid:.1%} of pixels that count"
+    if is_float and len(infinite := np.argwhere(np.isinf(frame))):
+        place = tuple(int(i) for i in infinite[0])
+        return f"frames must be finite, but pixel {(index, *place)} is {float(frame[place])}"
+    low, high = float(np.nanmin(valued)), float(np.nanmax(valued))
+    if not is_float and full_scale is not None and high > full_scale:
+        return f"{beyond_full_scale(round(high), full_scale)} (frame {index})"
+    largest = max(abs(high), abs(low))
+    if largest > MAX_NUMBER:
+        return f"frame {index} reaches {largest:.3g}, at most {MAX_NUMBER:g} is possible"
+    rounding = 1e-7  # of float32, relative
+    return constant_frame(index) if high - low <= rounding * largest else None
+
+
+# --- Motion ---
+
+# Least number of knots of a motion in the rows of a frame. With 8, half of the axes of small frames (192 rows, one to
+# six periods in a frame) were refused, which are reliable with 16 and 24.
+_KNOTS = 16
+_LEAST_FRAMES = 4  # fewer do not determine what a motion of any shape has in common in all frames
+# Reasons against an axis whose tones may change within the record
+_CHANGES = {"displacement_ambiguous", "rows_unexplained", "neighbours_unexplained"}
+
+
+@dataclass(frozen=True, eq=False)
+class WindowMotion:
+    """How the frames of a window move."""
+
+    motion: DetectedVibration | MotionDetection | FreeMotion  # what ``restore_trusted`` undoes
+    tones: DetectedVibration | None  # the vibration, or tones in its place; None of a recorded motion
+    free: FreeMotion | None = None  # that of a vibration that changes, whose axes rest that are not reliable
+
+
+def measured_motion(frames: Tensor, timing: SensorTiming, options: Mapping[str, Any]) -> WindowMotion:
+    """The vibration in frames (full scale 1); ``options`` are those of ``detect_vibration``.
+
+    Without options, a motion of any shape is measured if the tones may change, and taken if more axes are reliable.
+    """
+    detected = detect_vibration(frames, timing, **options)
+    if options or not may_change(detected, len(frames)):
+        return WindowMotion(detected, detected)
+    rows = frames.shape[int(timing.scan_axis)]
+    with suppress(ValueError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
+        found = detect_motion(frames, timing, knot_rows=min(24, max(4, rows // _KNOTS)))
+        if found.reliable.sum() > detected.reliable.sum():
+            return WindowMotion(found, _tones_of_detected(found, detected), reliable_motion(found)[0])
+    return WindowMotion(detected, detected)
+
+
+def known_motion(
+    given: DetectedVibration | FreeMotion, frames: Tensor, timing: SensorTiming, *, is_recorded: bool
+) -> WindowMotion:
+    """A motion that is given for the frames of a window: recorded, or measured in an earlier run."""
+    if isinstance(given, DetectedVibration):
+        return WindowMotion(given, given)
+    if is_recorded:
+        return WindowMotion(given, None)
+    starts, rows = timing.frame_starts(len(frames)), frames.shape[int(timing.scan_axis)]
+    last = float(starts[-1]) + (rows - 1) * timing.row_time + timing.exposure_time
+    unknown = torch.full((given.num_axes,), math.inf, dtype=torch.float64, device=given.coefficients.device)
+    tones = _tones_in_place_of(given, float(starts[0]), last, unknown, float(starts.diff().mean()))
+    return WindowMotion(given, tones, given)
+
+
+def may_change(detection: DetectedVibration, num_frames: int) -> bool:
+    """Whether tones that change within the frames may be why an axis of a steady vibration is not reliable.
+
+    They are not if the frames agree with another timing: a motion of any shape explains them with a wrong one as well.
+    """
+    codes = {one.code for of_axis in detection.findings for one in of_axis}
+    is_other_timing = any(code.startswith("other_") for code in codes)
+    return num_frames >= _LEAST_FRAMES and not is_other_timing and not _CHANGES.isdisjoint(codes)
+
+
+def reliable_motion(found: MotionDetection) -> tuple[FreeMotion, tuple[Reason, ...]]:
+    """A motion of any shape without the axes that are not reliable, and a reason for each of these."""
+    motion, factor = found.motion, found.reliable.to(found.motion.coefficients)
+    kept = FreeMotion(
+        motion.coefficients * factor[:, None], motion.start, motion.spacing, motion.tones.scaled(factor), motion.camera
+    )
+    refused = [
+        Reason("axis_not_reliable", name, details={"action": "restored", "why": "; ".join(reasons)})
+        for name, reasons in zip(AXIS_NAMES, found.reasons, strict=False)
+        if reasons
+    ]
+    return kept, tuple(refused)
+
+
+def _tones_of_detected(found: MotionDetection, refused: DetectedVibration) -> DetectedVibration:
+    """Tones in place of a detected motion, with the reasons against those that were refused as assumptions.
+
+    A wrong timing and lost frames have the same reasons as a vibration that changes.
+    """
+    against = zip(AXIS_NAMES, refused.findings, strict=False)
+    assumed = tuple(
+        f"the vibration changes; tones along {name} are refused: {one}" for name, of in against for one in of
+    )
+    first, last = float(found.times.min()), float(found.times.max())
+    std, interval = found.std.square().mean((0, 1)).sqrt(), float(found.times[:, 0].diff().mean())
+    tones = _tones_in_place_of(found.motion, first, last, std, interval)
+    return replace(
+        tones, residual=found.unexplained, reliable=found.reliable, findings=found.findings, assumptions=assumed
+    )
+
+
+def _tones_in_place_of(
+    motion: FreeMotion, first: float, last: float, displacement: Tensor, interval: float
+) -> DetectedVibration:
+    """A tone for each axis of a motion of any shape, to draw it and list it beside the tones of other windows.
+
+    The standard deviation of the frequency is half of the resolution of the record, which is that from ``first`` to
+    ``last`` (s) with frames every ``interval``; ``displacement`` (A,) is the standard deviation of the motion.
+    """
+    vibration = vibration_in_place_of(motion, first, last)
+    amplitude, frequency = vibration.amplitude, vibration.frequency
+    unknown = torch.full_like(amplitude, math.inf)
+    by_frequency = torch.full_like(amplitude, 0.5 / (last - first))
+    std = VibrationStd(
+        amplitude=math.sqrt(2) * displacement[:, None],
+        frequency=by_frequency,
+        phase=unknown,
+        period=by_frequency / frequency.square().clamp(min=1e-300),
+        image_motion=math.sqrt(12) * displacement / (last - first),
+        image_acceleration=unknown[:, 0],
+        displacement=displacement,
+    )
+    moves = motion.moving_axes()
+    none, findings = torch.zeros_like(displacement), tuple(() for _ in moves)
+    return DetectedVibration(vibration, std, vibration.gain(interval), none, moves, findings, assumptions=())
+
+
+# --- Restoration and verdict ---
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,105 +240,3 @@ def without_data(frames: Tensor, taken: Tensor) -> Tensor:
     if frames.ndim > missing.ndim:  # colours of a mosaic
         missing = missing.unsqueeze(-3)
     return frames.masked_fill(missing if len(frames) == len(taken) else missing.all(0), torch.nan)
-
-
-def frame_fault(frame: Array | str, index: int, full_scale: float | None, nodata: float | None) -> str | None:
-    """Why a frame as stored, or the error of reading it, cannot be used; None if it can be."""
-    if isinstance(frame, str):
-        return frame
-    is_float = frame.dtype.kind == "f"
-    valued = frame if nodata is None else frame[frame != frame.dtype.type(nodata)]
-    valid = (valued.size - (int(np.isnan(valued).sum()) if is_float else 0)) / frame.size
-    if valid < 0.1:
-        return f"frame {index} has only {valid:.1%} of pixels that count"
-    if is_float and len(infinite := np.argwhere(np.isinf(frame))):
-        place = tuple(int(i) for i in infinite[0])
-        return f"frames must be finite, but pixel {(index, *place)} is {float(frame[place])}"
-    low, high = float(np.nanmin(valued)), float(np.nanmax(valued))
-    if not is_float and full_scale is not None and high > full_scale:
-        return f"{beyond_full_scale(round(high), full_scale)} (frame {index})"
-    largest = max(abs(high), abs(low))
-    if largest > MAX_NUMBER:
-        return f"frame {index} reaches {largest:.3g}, at most {MAX_NUMBER:g} is possible"
-    rounding = 1e-7  # of float32, relative
-    return constant_frame(index) if high - low <= rounding * largest else None
-
-
-_LEAST_FRAMES = 4  # fewer do not determine what a motion of any shape has in common in all frames
-# Reasons against an axis whose tones may change within the record
-_CHANGES = {"displacement_ambiguous", "rows_unexplained", "neighbours_unexplained"}
-
-
-def may_change(detection: DetectedVibration, num_frames: int) -> bool:
-    """Whether tones that change within the frames may be why an axis of a steady vibration is not reliable.
-
-    They are not if the frames agree with another timing: a motion of any shape explains them with a wrong one as well.
-    """
-    codes = {one.code for of_axis in detection.findings for one in of_axis}
-    is_other_timing = any(code.startswith("other_") for code in codes)
-    return num_frames >= _LEAST_FRAMES and not is_other_timing and not _CHANGES.isdisjoint(codes)
-
-
-def equivalent_tones(found: MotionDetection, detection: DetectedVibration) -> DetectedVibration:
-    """``tones_in_place_of`` a detected motion, with the reasons against the tones of the ``detection`` as assumptions.
-
-    A wrong timing and lost frames have the same reasons as a vibration that changes.
-    """
-    against = zip(AXIS_NAMES, detection.findings, strict=False)
-    refused = tuple(
-        f"the vibration changes; tones along {name} are refused: {one}" for name, of in against for one in of
-    )
-    first, last = float(found.times.min()), float(found.times.max())
-    std, interval = found.std.square().mean((0, 1)).sqrt(), float(found.times[:, 0].diff().mean())
-    tones = tones_in_place_of(found.motion, first, last, std, interval)
-    return replace(
-        tones, residual=found.unexplained, reliable=found.reliable, findings=found.findings, assumptions=refused
-    )
-
-
-def tones_of_given(motion: FreeMotion, timing: SensorTiming, num_frames: int, rows: int) -> DetectedVibration:
-    """``tones_in_place_of`` a motion of a window that was measured before, whose standard deviations are unknown."""
-    starts = timing.frame_starts(num_frames)
-    last = float(starts[-1]) + (rows - 1) * timing.row_time + timing.exposure_time
-    unknown = torch.full((motion.num_axes,), math.inf, dtype=torch.float64, device=motion.coefficients.device)
-    return tones_in_place_of(motion, float(starts[0]), last, unknown, float(starts.diff().mean()))
-
-
-def tones_in_place_of(
-    motion: FreeMotion, first: float, last: float, displacement: Tensor, interval: float
-) -> DetectedVibration:
-    """A tone for each axis of a motion of any shape, to draw it and list it beside the tones of other windows.
-
-    The standard deviation of the frequency is half of the resolution of the record, which is that from ``first`` to
-    ``last`` (s) with frames every ``interval``; ``displacement`` (A,) is the standard deviation of the motion.
-    """
-    vibration = vibration_in_place_of(motion, first, last)
-    amplitude, frequency = vibration.amplitude, vibration.frequency
-    unknown = torch.full_like(amplitude, math.inf)
-    by_frequency = torch.full_like(amplitude, 0.5 / (last - first))
-    std = VibrationStd(
-        amplitude=math.sqrt(2) * displacement[:, None],
-        frequency=by_frequency,
-        phase=unknown,
-        period=by_frequency / frequency.square().clamp(min=1e-300),
-        image_motion=math.sqrt(12) * displacement / (last - first),
-        image_acceleration=unknown[:, 0],
-        displacement=displacement,
-    )
-    moves = motion.moving_axes()
-    none, findings = torch.zeros_like(displacement), tuple(() for _ in moves)
-    return DetectedVibration(vibration, std, vibration.gain(interval), none, moves, findings, assumptions=())
-
-
-def reliable_motion(found: MotionDetection) -> tuple[FreeMotion, tuple[Reason, ...]]:
-    """A motion of any shape without the axes that are not reliable, and a reason for each of these."""
-    motion, factor = found.motion, found.reliable.to(found.motion.coefficients)
-    kept = FreeMotion(
-        motion.coefficients * factor[:, None], motion.start, motion.spacing, motion.tones.scaled(factor), motion.camera
-    )
-    refused = [
-        Reason("axis_not_reliable", name, details={"action": "restored", "why": "; ".join(reasons)})
-        for name, reasons in zip(AXIS_NAMES, found.reasons, strict=False)
-        if reasons
-    ]
-    return kept, tuple(refused)

@@ -1,16 +1,21 @@
-"""Windows: consecutive frames that are processed together, and the records of their results."""
+"""Windows: consecutive frames that are processed together, their results, and the records of these on the disk."""
 
 import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
+from torch import Tensor
 
 from rsvib_torch.checks.values import check_whole_number
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.numerics.tables import Array
+from rsvib_torch.results.presentation import Summarised, plain_values
 from rsvib_torch.results.reason import Reason
+from rsvib_torch.stacks.window_restoration import RestoredFrames
 
 
 @dataclass(frozen=True)
@@ -68,6 +73,38 @@ def window_timing(timing: SensorTiming, window: Window, frames: list[int]) -> Se
     return replace(timing, frame_start_times=starts[torch.tensor(frames, device="cpu")] - starts[window.first])
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class WindowResult(Summarised):
+    """One window of a stack, restored."""
+
+    window: Window
+    indices: tuple[int, ...]  # of ``frames`` in the stack; empty if all frames were restored jointly as one image
+    frames: Tensor  # with full scale 1, (T, H, W) or (T, C, H, W): restored, or as taken
+    # with the time origin at the window's first frame; None if it failed. With a ``motion``, tones in its place
+    detection: DetectedVibration | None
+    restoration: RestoredFrames | None  # None without a detection
+    error: str | None  # why detection or restoration failed
+    bad_frames: Mapping[int, str]  # frames of ``window.written`` that could not be used; they are not in ``frames``
+    motion: FreeMotion | None = None  # of a vibration that changes, in place of tones; axes that are not reliable rest
+
+    @property
+    def restored(self) -> bool:
+        """Whether the frames are restored."""
+        return self.restoration is not None and self.restoration.restored
+
+    def summary(self) -> str:
+        """Frames of the window, its vibration, and what was restored."""
+        state = "restored" if self.restored else "unchanged"
+        lines = [f"window {self.window.index}, frames {self.window.first} … {self.window.last}: {state}"]
+        if self.detection is not None:
+            lines.append(self.detection.summary())
+        if self.restoration is not None:
+            lines += map(str, self.restoration.left_alone)
+            lines += [] if self.restoration.verdict is None else [self.restoration.verdict.sentence]
+        lines += [] if self.error is None else [self.error]
+        return "\n".join([*lines, *(f"frame {index}: {fault}" for index, fault in self.bad_frames.items())])
+
+
 @dataclass(frozen=True, eq=False)
 class WindowRecord:
     """Result of one window."""
@@ -78,7 +115,7 @@ class WindowRecord:
     start_time: float  # s, exposure start of its first row, the time origin of its detection
     written: int  # number of frames written
     frames: Literal["restored", "as taken"]  # those that are written
-    detection: DetectedVibration | None = None  # None: it failed; with a ``motion``, its ``equivalent_tones``
+    detection: DetectedVibration | None = None  # None: it failed; with a ``motion``, tones in its place
     left_alone: tuple[Reason, ...] = ()  # a reason for each axis that was not restored
     outcome: str | None = None  # ``RestorationVerdict.overall``; None if the frames could not be compared
     predicted_gain: float | None = None  # dB, mean of ``RestorationVerdict.predicted_gain``; None if unknown
@@ -88,3 +125,33 @@ class WindowRecord:
     # motion of the frame, and ``rows``, of twelfths of the rows beside it. None: not measured.
     shaking: dict[str, tuple[float, ...]] | None = None
     motion: FreeMotion | None = None  # of a window in which the vibration changes, in place of tones; as the detection
+
+    @classmethod
+    def of(cls, result: WindowResult, timing: SensorTiming, written: int) -> "WindowRecord":
+        """The record of a result of which ``written`` frames were written; ``timing`` is that of the whole stack."""
+        window, restoration = result.window, result.restoration
+        verdict = None if restoration is None else restoration.verdict
+        return cls(
+            window=window.index,
+            first=window.first,
+            last=window.last,
+            start_time=float(timing.frame_starts(window.first + 1)[-1]),
+            written=written,
+            frames="restored" if result.restored else "as taken",
+            detection=None if result.detection is None else DetectedVibration.of(result.detection).to("cpu"),
+            outcome=None if verdict is None else verdict.overall,
+            predicted_gain=None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),
+            bad_frames={str(index): reason for index, reason in result.bad_frames.items()},
+            left_alone=() if restoration is None else restoration.left_alone,
+            error=result.error,
+            motion=None if result.motion is None else result.motion.to("cpu"),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class StoredWindow:
+    """A window as it is stored on the disk."""
+
+    record: WindowRecord
+    frames: Array  # those that are written, as the file has them
+    result: WindowResult | None  # of the first window of the stack, for the summary of the run

@@ -13,7 +13,6 @@ from rsvib_torch.checks.arguments import PathLike
 from rsvib_torch.checks.values import fields_of
 from rsvib_torch.execution.parallel import in_threads
 from rsvib_torch.files.atomic import whole_file
-from rsvib_torch.files.reading import Table
 from rsvib_torch.frames.entry_points import file_options
 from rsvib_torch.gyroscope.gpmf_track import read_camera_track
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
@@ -30,7 +29,7 @@ from rsvib_torch.results.presentation import plain_values
 from rsvib_torch.stacks.job import plan_job
 from rsvib_torch.stacks.manifest import fingerprint, manifest_header, rms_shaking
 from rsvib_torch.stacks.memory import share_one_heap
-from rsvib_torch.stacks.run_folder import RunFolder, StackReport, run_to_file
+from rsvib_torch.stacks.run_folder import FileRun, RunFolder, StackReport
 from rsvib_torch.video import Margins
 from rsvib_torch.video.video_frames import Frame, FrameTrack, VideoFrames
 from rsvib_torch.video.video_passes import PART_FRAMES, VideoMotion, VideoPasses, shakes_more
@@ -120,8 +119,13 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         },
     }
 
-    def compute(folder: RunFolder) -> Table:
-        nonlocal content
+    inputs = [*stack_files(source), *(Path(file) for file in (recording, options.lens_profile) if file is not None)]
+    run = FileRun(sink, options, header, inputs)
+    finished = run.finished()
+    if finished is not None:
+        return finished
+    with run.folder() as folder:
+        resumed = len(folder.records())
         done = count(1)  # both passes through the video count as half of it each
 
         def progress() -> None:
@@ -142,20 +146,10 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         if isinstance(motion.path, RotationAlignment):
             gyroscope = {name: plain_values(getattr(motion.path, name)) for name in _OF_GYROSCOPE}
         not_kept = metadata_not_kept(job.info, sink, content.shape)
-        return {"margins": margins and asdict(margins), "gyroscope": gyroscope, "not_kept": not_kept}
-
-    def write(folder: RunFolder) -> None:
-        with whole_file(sink) as part:
+        stated = {"margins": margins and asdict(margins), "gyroscope": gyroscope, "not_kept": not_kept}
+        with run.writing(folder, **stated) as manifest, whole_file(sink) as part:
             join_parts(part, content, map(folder.open, folder.files()))
-
-    return run_to_file(
-        sink,
-        options,
-        header,
-        inputs=[*stack_files(source), *(Path(file) for file in (recording, options.lens_profile) if file is not None)],
-        compute=compute,
-        write=write,
-    )
+    return run.report(manifest, resumed)
 
 
 def _check_shaking(folder: RunFolder, *, is_explained: bool) -> None:

@@ -9,6 +9,10 @@ import pytest
 from program import refused, rsvib
 from small_stack import CAMERA, write_small
 
+from rsvib_torch.checks.values import fields_of
+from rsvib_torch.options import COMMAND_LINE, ProcessStackOptions, StackOptions
+from rsvib_torch.stacks import read_manifest
+
 
 @pytest.fixture(scope="module", name="place")
 def make_place(tmp_path_factory):
@@ -100,6 +104,20 @@ def test_a_complete_run_writes_tables_with_another_unit_or_in_place_of_those_of_
     assert "amplitude_um" in table.read_text()
     assert rsvib(*arguments, "--resume") == 0
     assert "amplitude_um" not in table.read_text()
+
+
+def test_marked_options_of_process_stack_are_those_of_run_and_restore(place, tmp_path, capsys):
+    """And a run is resumed only with the same values of those on which its result may depend."""
+    fields = fields_of(ProcessStackOptions)
+    marked = {f"--{name}" for name, field in fields.items() if field.json_schema_extra == COMMAND_LINE}
+    assert marked == {"--memory", "--workers", "--window", "--resume", "--compression"}
+    for name in ("run", "restore"):
+        assert rsvib(name, "--help") == 0
+        assert marked <= set(capsys.readouterr().out.split())
+    assert rsvib(*command(place, "run", tmp_path / "out"), "--compression", "zlib", "--workers", 1) == 0
+    manifest = read_manifest(tmp_path / "out" / "manifest.json")
+    assert manifest.output["compression"] == "zlib"
+    assert manifest.settings.keys() == {"sensor", "given", *fields_of(StackOptions)} - {"memory", "workers"}
 
 
 def test_a_session_that_is_stopped_before_it_begins_is_one_line(place, tmp_path, capsys, monkeypatch):

@@ -1,9 +1,11 @@
 """rsvib init: configuration files for the camera of a stack."""
 
+import shlex
 import tomllib
 
 import numpy as np
 import pytest
+import tifffile
 import torch
 from program import refused, rsvib
 from small_video import write_video
@@ -108,6 +110,14 @@ def test_errors_are_one_line_and_write_nothing(place, frames, capsys, options, m
     error = refused(capsys, "init", "f.npy", *(part for pair in values.items() for part in pair))
     assert message in error
     assert sorted(path.name for path in place.iterdir()) == ["f.npy"]
+
+
+def test_the_first_example_describes_frames_of_twelve_bits(place, frames, capsys):
+    tifffile.imwrite("frames.tif", (4095 * frames.numpy()).astype(np.uint16), photometric="minisblack", metadata=None)
+    assert init("--help") == 0
+    example = capsys.readouterr().out.partition("Examples:")[2].replace("\\\n", " ").splitlines()[1]
+    assert rsvib(*shlex.split(example)[1:]) == 0
+    assert read_config("camera.toml").full_scale == 4095
 
 
 @pytest.mark.parametrize(

@@ -129,6 +129,12 @@ def test_residual_motion_makes_axes_unreliable(residual, against):
     assert codes(verdict(rows=rows_of(**residual))) == against
 
 
+def test_rows_that_are_not_registered_may_be_those_of_all_frames():
+    """The only group of frames, or one of many."""
+    (reason, *_), _ = verdict(rows=rows_of(measured=0.4))
+    assert "40% of the rows that frames have in common can be registered" in str(reason)
+
+
 @pytest.mark.parametrize(
     ("residual", "axis", "allowed"),
     [("unexplained", 0, (0.05, 0.1)), ("correlated", 0, (0.01, 0.05)), ("differential", 1, (0.035, 0.18))],

@@ -2,6 +2,7 @@
 
 import resource
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -27,6 +28,15 @@ def test_stack_that_does_not_fit_is_refused_before_it_is_read(tmp_path, set_free
     set_free(needed - 1)
     refuses(lambda: read_stack(paths), r"a.npy: 4 frames of 16 x 16 px need .* KB .*; process the stack in windows")
     refuses(lambda: rsv.detect_vibration(paths, TIMING), r"need .* of memory")
+
+
+def test_a_chunk_of_hdf5_may_exceed_a_short_recording_but_not_by_much(tmp_path):
+    layout = {"maxshape": (None, None, None), "compression": 1}
+    for name, chunks in (("short.h5", (64, 16, 16)), ("huge.h5", (8, 3000, 3000))):
+        with h5py.File(tmp_path / name, "w") as file:
+            file.create_dataset("frames", COUNTS.shape, "u2", chunks=chunks, **layout)[...] = COUNTS
+    assert len(read_stack(tmp_path / "short.h5", full_scale=4095)) == len(COUNTS)
+    refuses(lambda: read_stack_info(tmp_path / "huge.h5"), "a chunk of 144 MB holds a stack of 2.05 KB")
 
 
 def test_video_frames_that_do_not_fit(tmp_path, set_free):

@@ -97,6 +97,15 @@ def test_all_tones_are_followed_over_the_windows():
     assert all(f"{windows} of 4" in text for windows in (3, 2, 1))
 
 
+def test_a_table_without_tones_has_no_explanation_of_its_columns():
+    table, *explained = manifest_of(window(0, TWO_TONES), window(1, TWO_TONES)).lines()[0]
+    assert explained == ["median ± standard deviation over the windows"]
+    assert table.split("\n")[1].split() == ["x", "2", "of", "2", "2.000", "60.00"]
+    assert manifest_of(window(0, None), window(1, None)).lines()[0] == [
+        "axis  reliable windows  amplitude (px)  frequency (Hz)\nx     0 of 2\ny     0 of 2"
+    ]
+
+
 def test_pandas_frame_is_the_table():
     pytest.importorskip("pandas")
     frame = detection_of(TWO_TONES).to_pandas(pixel_size=1e-6)

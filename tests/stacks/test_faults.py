@@ -13,6 +13,9 @@ import tifffile
 from attacks.small_runs import fork
 from small_stack import FRAMES, OPTIONS, WINDOWS, process_small, stop_after
 
+from rsvib_torch.io import read_stack_info
+from rsvib_torch.io.array_stores import open_npy, write_npy
+from rsvib_torch.io.formats import FORMATS, StackFormat
 from rsvib_torch.stacks import read_manifest
 from rsvib_torch.stacks.run_folder import work_folder
 
@@ -83,11 +86,34 @@ def test_resuming_a_complete_run_changes_nothing(whole, tmp_path):
     assert (tmp_path / "out.npy").stat().st_mtime_ns == before
 
 
+def test_a_link_to_itself_in_place_of_the_folder_of_a_complete_run_is_refused(whole, tmp_path):
+    process_small(whole / "frames.tif", tmp_path / "out.npy")
+    link = work_folder(tmp_path / "out.npy")
+    link.symlink_to(link.name)
+    with pytest.raises(FileExistsError, match="was not made by a run, it is a link"):
+        process_small(whole / "frames.tif", tmp_path / "out.npy", resume=True)
+    assert link.is_symlink()
+
+
 def test_full_disk_is_an_error_before_the_computation(whole, tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=100_000))
     with pytest.raises(OSError, match=r"No space left on device: a run needs 418 KB, 100 KB are free"):
         process_small(whole / "frames.tif", tmp_path / "new" / "out.npy")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_format_is_one_entry_of_the_table(whole, tmp_path, monkeypatch):
+    """It is read and written, and its size is that of its pixels."""
+    monkeypatch.setitem(FORMATS, ".own", StackFormat("own", (".own",), open_npy, write_npy, uncompressed=True))
+    process_small(whole / "frames.tif", tmp_path / "out.own")
+    assert (tmp_path / "out.own").read_bytes() == (whole / "out.npy").read_bytes()
+    assert read_stack_info(tmp_path / "out.own").shape[0] == FRAMES
+    for uncompressed, needed in ((True, "418 KB"), (False, "209 KB")):
+        form = StackFormat("own", (".own",), open_npy, write_npy, uncompressed=uncompressed)
+        monkeypatch.setitem(FORMATS, ".own", form)
+        monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=100_000))
+        with pytest.raises(OSError, match=f"a run needs {needed}, 100 KB are free"):
+            process_small(whole / "frames.tif", tmp_path / "other.own")
 
 
 def test_disk_that_fills_up_keeps_complete_windows(whole, tmp_path):
