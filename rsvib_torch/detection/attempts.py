@@ -30,7 +30,7 @@ from rsvib_torch.detection.tones.selection import MIN_SIGNIFICANCE, find_tones, 
 from rsvib_torch.detection.verdict import contradicted_axes, halves_move_apart, rotation_possible
 from rsvib_torch.frames.prepare import GreyFrames
 from rsvib_torch.motion.camera import Camera
-from rsvib_torch.motion.timing import RowTiming, SensorTiming
+from rsvib_torch.motion.timing import RowTiming, SensorTiming, with_lost_frame
 from rsvib_torch.numerics.tables import Array, median, split_axis, table, take_stacks
 from rsvib_torch.registration.register import fits_frame
 from rsvib_torch.results.reason import Reason
@@ -187,7 +187,7 @@ def _diagnosis(
         bands = take_stacks([found.start.measurements], np.array([index]))
         first = first_after_gap(bands, timing.in_row_order(), starts)
         if first is not None:
-            candidates.append(replace(timing, frame_start_times=tuple(with_gap(starts, first).tolist())))
+            candidates.append(with_lost_frame(timing, num_frames, first))
     # With the wrong scan axis, the halves of a row are exposed at different times and move apart.
     if rotates and width <= timing.frame_rows and fits_frame(width, height, found.options.bands):
         candidates.append(replace(timing, scan_axis="x" if timing.scan_axis == -2 else "y"))
@@ -250,11 +250,6 @@ def _with_starts(
     return trial, robust_fit(trial, frequencies, active, iterations=_ITERATIONS)[0]
 
 
-def with_gap(starts: Array, first: int) -> Array:
-    """Start times of frames of which the one before the frame ``first`` was lost."""
-    return starts + (starts[1] - starts[0]) * (np.arange(len(starts)) >= first)
-
-
 # of the square of the residual of the bands with the stated times. Of 215 recordings with a lost frame, whose motion
 # was drawn with up to three tones along each axis, 54 are diagnosed, all of them at the right frame
 _SMALLER_OF_BANDS = 0.5
@@ -267,7 +262,8 @@ def first_after_gap(bands: Measurements, timing: RowTiming, starts: Array) -> in
     the other side. The offsets are those of the pairs of consecutive frames of one stack.
     """
     pairs = len(starts) - 1
-    others = np.stack([starts, *(with_gap(starts, first) for first in range(1, pairs + 1))])
+    frames = np.arange(pairs + 1)
+    others = starts + timing.frame_period * ((frames >= frames[:, None]) & (frames[:, None] > 0))
     trial, fit = _with_starts(bands, timing, starts, others)
     sizes = median(split_axis(trial.sizes(residual_of(trial, fit)), 1, pairs, -1), 2)  # (F, P, A)
     stated, *with_gaps = np.nanmean(np.square(sizes), (1, 2))

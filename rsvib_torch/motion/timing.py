@@ -11,7 +11,7 @@ import math
 import os
 import warnings
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -359,6 +359,13 @@ class RowTiming(SensorTiming):
                 f"scan_axis={self.scan_axis}, readout_direction={self.readout_direction!r}; "
                 "SensorTiming.in_row_order() converts a timing"
             )
+
+
+def with_lost_frame(timing: SensorTiming, num_frames: int, first: int) -> SensorTiming:
+    """The timing of ``num_frames`` frames of which the one before the frame ``first`` was lost."""
+    starts: list[float] = timing.frame_starts(num_frames).tolist()
+    later = [start + timing.frame_period * (frame >= first) for frame, start in enumerate(starts)]
+    return replace(timing, frame_start_times=tuple(later))
 
 
 def check_timing(value: object) -> None:

@@ -102,13 +102,14 @@ class StackJob:
                 if given is None:
                     return replace(result, error="no detection was given for this window")
                 moved = known_motion(given, taken, timing, is_recorded=options.motion is not None)
-            result = replace(result, detection=moved.tones, motion=moved.free)
+            lost_before = None if moved.lost_before is None else window.first + moved.lost_before
+            result = replace(result, detection=moved.tones, motion=moved.free, lost_before=lost_before)
             if options.restoration is None:
                 return result
             # 3. The frames without it, and whether they are better.
             restoration = restore_trusted(
                 taken,
-                timing,
+                moved.timing,
                 moved.motion,
                 self.chosen,
                 force=options.force,

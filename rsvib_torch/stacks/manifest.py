@@ -195,6 +195,10 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
                 if record.detection is not None and record.motion is not None and record.detection.assumptions
             }
             lines += [wrapped(f"assumed in {note}") for note in _first_of(refused)]
+        lost = [f"{one.lost_before} (window {one.window})" for one in self.windows if one.lost_before is not None]
+        if lost:
+            text = "of their windows are taken a frame period later; state the times of all frames if they are known"
+            lines.append(wrapped(f"a frame is lost before frame {', '.join(lost)}: the later frames {text}"))
         return lines
 
     def _lines_of_video(self) -> list[str]:
@@ -233,9 +237,13 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
     def detections(self) -> list[DetectedVibration | FreeMotion | None]:
         """The detection of every window, or its motion if the vibration changes; None where it failed.
 
-        They are the ``given`` of ``process_stack``.
+        They are the ``given`` of ``process_stack``, which takes frames at their stated times: None also after a lost
+        frame.
         """
-        return [record.detection if record.motion is None else record.motion for record in self.windows]
+        return [
+            None if one.lost_before is not None else one.detection if one.motion is None else one.motion
+            for one in self.windows
+        ]
 
 
 def _first_of(notes: Mapping[object, str]) -> list[str]:

@@ -21,7 +21,7 @@ from rsvib_torch.imaging.sensor_model import sharpened
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
-from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.timing import SensorTiming, with_lost_frame
 from rsvib_torch.motion.vibration import VibrationStd
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import RestorationOptions
@@ -69,27 +69,35 @@ _CHANGES = {"displacement_ambiguous", "rows_unexplained", "neighbours_unexplaine
 
 @dataclass(frozen=True, eq=False)
 class WindowMotion:
-    """How the frames of a window move."""
+    """How the frames of a window move, and when they were taken."""
 
     motion: DetectedVibration | MotionDetection | FreeMotion  # what ``restore_trusted`` undoes
     tones: DetectedVibration | None  # the vibration, or tones in its place; None of a recorded motion
+    timing: SensorTiming  # of the frames
     free: FreeMotion | None = None  # that of a vibration that changes, whose axes rest that are not reliable
+    lost_before: int | None = None  # the first frame of the window after a lost one; its later time is in ``timing``
 
 
 def measured_motion(frames: Tensor, timing: SensorTiming, options: Mapping[str, Any]) -> WindowMotion:
     """The vibration in frames (full scale 1); ``options`` are those of ``detect_vibration``.
 
-    Without options, a motion of any shape is measured if the tones may change, and taken if more axes are reliable.
+    If the frames agree with a lost one, its time is taken into account. Without options, a motion of any shape is
+    measured if the tones may change, and taken if more axes are reliable.
     """
     detected = detect_vibration(frames, timing, **options)
+    lost = next((one.details["after"] for one in detected.findings[0] if one.code == "other_frame_times"), None)
+    if isinstance(lost, int):
+        timing = with_lost_frame(timing, len(frames), lost)
+        detected = detect_vibration(frames, timing, **options)
+        return WindowMotion(detected, detected, timing, lost_before=lost)
     if options or not may_change(detected, len(frames)):
-        return WindowMotion(detected, detected)
+        return WindowMotion(detected, detected, timing)
     rows = frames.shape[int(timing.scan_axis)]
     with suppress(ValueError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
         found = detect_motion(frames, timing, knot_rows=min(24, max(4, rows // _KNOTS)))
         if found.reliable.sum() > detected.reliable.sum():
-            return WindowMotion(found, _tones_of_detected(found, detected), reliable_motion(found)[0])
-    return WindowMotion(detected, detected)
+            return WindowMotion(found, _tones_of_detected(found, detected), timing, reliable_motion(found)[0])
+    return WindowMotion(detected, detected, timing)
 
 
 def known_motion(
@@ -97,14 +105,14 @@ def known_motion(
 ) -> WindowMotion:
     """A motion that is given for the frames of a window: recorded, or measured in an earlier run."""
     if isinstance(given, DetectedVibration):
-        return WindowMotion(given, given)
+        return WindowMotion(given, given, timing)
     if is_recorded:
-        return WindowMotion(given, None)
+        return WindowMotion(given, None, timing)
     starts, rows = timing.frame_starts(len(frames)), frames.shape[int(timing.scan_axis)]
     last = float(starts[-1]) + (rows - 1) * timing.row_time + timing.exposure_time
     unknown = torch.full((given.num_axes,), math.inf, dtype=torch.float64, device=given.coefficients.device)
     tones = _tones_in_place_of(given, float(starts[0]), last, unknown, float(starts.diff().mean()))
-    return WindowMotion(given, tones, given)
+    return WindowMotion(given, tones, timing, given)
 
 
 def may_change(detection: DetectedVibration, num_frames: int) -> bool:

@@ -86,6 +86,7 @@ class WindowResult(Summarised):
     error: str | None  # why detection or restoration failed
     bad_frames: Mapping[int, str]  # frames of ``window.written`` that could not be used; they are not in ``frames``
     motion: FreeMotion | None = None  # of a vibration that changes, in place of tones; axes that are not reliable rest
+    lost_before: int | None = None  # frame of the stack before which one is lost: from it on, a frame period later
 
     @property
     def restored(self) -> bool:
@@ -125,6 +126,7 @@ class WindowRecord:
     # motion of the frame, and ``rows``, of twelfths of the rows beside it. None: not measured.
     shaking: dict[str, tuple[float, ...]] | None = None
     motion: FreeMotion | None = None  # of a window in which the vibration changes, in place of tones; as the detection
+    lost_before: int | None = None  # frame of the stack before which one is lost: from it on, a frame period later
 
     @classmethod
     def of(cls, result: WindowResult, timing: SensorTiming, written: int) -> "WindowRecord":
@@ -145,6 +147,7 @@ class WindowRecord:
             left_alone=() if restoration is None else restoration.left_alone,
             error=result.error,
             motion=None if result.motion is None else result.motion.to("cpu"),
+            lost_before=result.lost_before,
         )
 
 

@@ -209,3 +209,16 @@ def test_windows_that_agree_with_another_timing_are_not_measured_without_tones(t
     rsv.process_stack(tmp_path / "frames.npy", tmp_path / "out.npy", wrong, restoration={"method": "dewarp"})
     (record,) = read_manifest(tmp_path / "out.npy.manifest.json").windows
     assert "other_frame_rows" in record.detection.codes((0,))
+
+
+def test_frames_after_a_lost_one_are_taken_a_frame_period_later(tmp_path):
+    """Frame 11 of 20 is lost: the second window agrees with it, and all frames are restored."""
+    frames = np.delete(take_frames(SCENE, TIMING, Curve(steady), 20, noise=0.003), 11, axis=0)
+    np.save(tmp_path / "frames.npy", frames.astype(np.float32))
+    process(tmp_path, tmp_path / "out.npy")
+    manifest = read_manifest(tmp_path / "out.npy.manifest.json")
+    assert [record.lost_before for record in manifest.windows] == [None, 11, None]
+    assert all(bool(record.detection.reliable.all()) for record in manifest.windows)
+    assert "a frame is lost before frame 11 (window 1)" in manifest.summary()
+    assert [given is None for given in manifest.detections()] == [False, True, False]
+    assert min(decibel(frame, STILL) for frame in np.load(tmp_path / "out.npy")) > 37
