@@ -5,7 +5,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -292,10 +292,8 @@ class SampledRows:
         # 1. One system for each prior, slab and frequency. Those with a prior that is stronger by a factor s give the
         # degrees of freedom n - d log det A / d log s: a difference quotient.
         products, step = torch.cat([*precisions], 2).repeat_interleave(slabs, 2), 1.2
-        normal = observation.normal(len(products) - 1)
-        left = normal.left.repeat(1, 1, 2 * number, 1)
-        both = replace(normal, left=left).in_windows([slice(0, observation.count)])
-        system = both.at(observation.u, torch.cat([products, step * products], 2))
+        normal = observation.normal(len(products) - 1).in_windows([slice(0, observation.count)])
+        system = normal.at(observation.u, torch.cat([products, step * products], 2))
         factor, stronger = factor_banded(system, observation.count).split(2)
         growth = (stronger.log_determinant() - factor.log_determinant()).view(number, scenes, slabs, frequencies)
         freedom = observation.count * slabs - growth.sum(2) / math.log(step)
