@@ -128,6 +128,12 @@ def restore(
         mosaic=options.mosaic,
     )
     warn_of_mosaic(prepared)
+    if prepared.lost is not None:
+        rows, frames_of = int(prepared.lost.sum()), prepared.lost.any(-1).nonzero()[:, 1].unique().tolist()
+        warn_of_restoration(
+            f"{rows} rows of frames {frames_of} have one value, but detail in other frames: they count as pixels "
+            "without data"
+        )
     timing = prepared.image_timing
     _, count, _, height, _ = prepared.images.shape
     vibration, left_alone = vibration_to_undo(vibration, timing, count, height)
