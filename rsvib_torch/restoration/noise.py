@@ -203,7 +203,7 @@ def _residual_power(images: Tensor, displacement: Tensor, node_weights: Tensor) 
     sample = sample_rows(images, kernels, chosen)
     # correlation 0.9 of neighbouring rows of the scene, of weight 1e-4 beside the data
     products = torch.tensor([[1.0, 0.9**2], [-0.9, 0.0]], dtype=torch.float64, device=images.device)
-    power, rest = sample.unexplained(1e-4 * products[None, :, :, None, None].expand(-1, -1, -1, len(images), count))
+    power, rest = sample.unexplained(1e-4 * products[:, :, None, None].expand(-1, -1, len(images), count))
     return torch.as_tensor(power[0].sum(-1) / rest[0].sum(-1), dtype=images.dtype, device=images.device)
 
 
