@@ -151,8 +151,9 @@ class FrameModel(MovingFrames):
 
         Those of its frames whose columns are the same as in the restored one are used.
         """
-        if not isinstance(self.prior, RowPrior):
-            return np.ones(len(scenes.stack))  # the strength of other priors is not selected
+        # The strength of other priors is not selected. Noise of a single frame includes texture: it is no weaker.
+        if not isinstance(self.prior, RowPrior) or not self.level_is_certain:
+            return np.ones(len(scenes.stack))
         _, first, of_scenes = np.unique(scenes.stack[:, 0] // self.strips, return_index=True, return_inverse=True)
         chosen = take_stacks([scenes], first)
         chosen = replace(chosen, contributes=chosen.contributes & (chosen.moved == 0).all(-1))
@@ -168,7 +169,6 @@ class FrameModel(MovingFrames):
                 self.prior.of(stack_of[:, 0], member_of),
                 self.level[stack_of].square(),
                 torch.as_tensor(some.blur_reach[:, None], device=self.images.device),
-                certain=self.level_is_certain,
             )
             strengths.append(found)
         result: NDArray[np.float64] = np.concatenate(strengths)[of_scenes]
