@@ -17,7 +17,7 @@ from torch.nn import functional
 from rsvib_torch.execution.parallel import at_once, runs
 from rsvib_torch.numerics.banded_solver import factor_banded
 from rsvib_torch.numerics.interpolation import extend_rows, mirrored, squared_modulus, waves
-from rsvib_torch.numerics.tables import Array, constant, table, tables
+from rsvib_torch.numerics.tables import Array, constant, tables
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.observation import Observation, RowKernels, kernel_spectrum
 
@@ -379,7 +379,11 @@ def prior_strengths(
     precisions = of_all.precision(noise_power.repeat(number, 1), strength, blur_reach.repeat(number, 1))
     power, rest = sample.unexplained(precisions)
     # 2. ``n |r|^2 / (n - freedom)^2`` of Craven and Wahba (1979) estimates the squared error of predicting a pixel from
-    # all others. The geometric mean gives all frequencies the same weight: the sum, in which those with the largest
-    # errors dominate, lost 0.2 to 2.8 dB in five of 124 restorations.
-    score = (np.log(power) - 2 * np.log(rest)).mean(-1) + _HANDICAP * np.log2(_STRENGTHS)[:, None]
-    return _STRENGTHS[score.argmin(0)]
+    # all others. The sum over the frequencies is dominated by those with the largest errors; the geometric mean gives
+    # all the same weight. The weaker of the two selected priors is used: with the mean alone, the ends of a grating
+    # lose 6 dB; with the sum alone, five of 124 restorations lose 0.2 to 2.8 dB.
+    of_sum = np.log(power.sum(-1)) - 2 * np.log(rest.sum(-1))
+    geometric = (np.log(power) - 2 * np.log(rest)).mean(-1)
+    handicap = _HANDICAP * np.log2(_STRENGTHS)[:, None]
+    selected = [(values + handicap).argmin(0) for values in (of_sum, geometric)]
+    return _STRENGTHS[np.maximum(*selected)]
