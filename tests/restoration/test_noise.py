@@ -37,8 +37,6 @@ def test_two_frames_separate_texture_from_noise(image_motion):
     found = levels(frames + noise, motion)
     assert found[0].item() == pytest.approx(0.004, rel=0.3)
     assert found[1].item() == pytest.approx(0.008, rel=0.15)
-    single = frames[:1] + noise[:1]
-    assert 0.33 * alone[0].item() <= levels(single, motion)[0].item() < 0.75 * alone[0].item()
 
 
 @pytest.mark.parametrize("shape", [(128, 96), (512, 512)])
