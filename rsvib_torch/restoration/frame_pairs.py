@@ -5,6 +5,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -14,9 +15,9 @@ from torch.nn import functional
 
 from rsvib_torch.execution.parallel import at_once, runs
 from rsvib_torch.frames.pixels import cut_columns, cut_parts, detailed_parts
-from rsvib_torch.imaging.blur import form_rows
+from rsvib_torch.imaging.blur import form_rows, row_taps
 from rsvib_torch.motion.motion import ColumnMotion
-from rsvib_torch.numerics.interpolation import correlated, extended_length, spline_spectra
+from rsvib_torch.numerics.interpolation import bspline_weights, correlated, extended_length, spline_spectra
 from rsvib_torch.numerics.tables import Array, tables
 from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion
 
@@ -180,15 +181,14 @@ def reblur(
     members = displacement[stack[:, None], frame[:, None], first_row[:, None] + np.arange(height)]
     along, across = (members - motion.shift[stack, frame][:, None, None]).unbind(-1)
     place = torch.arange(height, device=scenes.device)[:, None] - across
-    low, high = place.aminmax(dim=-1)
-    reach, blur = torch.stack([along.abs().amax(), (high - low).amax()]).tolist()
     # spectra of the spline coefficients (..., N, h, U), and a few rows of the frames at a time
-    length = extended_length(width, math.ceil(reach))
+    length = extended_length(width, math.ceil(float(along.abs().amax())))
     u = torch.fft.rfftfreq(length, dtype=scenes.dtype, device=scenes.device)
     spectra, along = spline_spectra(scenes.movedim(0, -3), degree, length), along.to(scenes.dtype)
-    step = at_once(16 * (degree + 1 + math.ceil(blur)) * len(u) * len(scenes), scenes.device)
+    first, taps = row_taps(place, node_weights, partial(bspline_weights, degree=degree))
+    step = at_once(16 * taps.shape[-2] * len(u) * len(scenes), scenes.device)
     formed = [
-        form_rows(spectra, place[:, part], along[:, part], node_weights, u, degree) for part in runs(height, step)
+        form_rows(spectra, first[:, part], taps[:, part], along[:, part], u, degree) for part in runs(height, step)
     ]
     return torch.fft.irfft(torch.cat(formed, dim=-2), n=length)[..., :width].movedim(-3, 0)
 
