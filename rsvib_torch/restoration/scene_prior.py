@@ -16,7 +16,7 @@ from torch.nn import functional
 
 from rsvib_torch.execution.parallel import at_once, runs
 from rsvib_torch.numerics.banded_solver import factor_banded
-from rsvib_torch.numerics.interpolation import extend_rows, mirrored, squared_modulus, waves
+from rsvib_torch.numerics.interpolation import extend_rows, squared_modulus, waves
 from rsvib_torch.numerics.tables import Array, constant, tables, without_nan
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.observation import Observation, RowKernels, kernel_spectrum
@@ -251,22 +251,15 @@ def fit_prior(frames: Tensor, motion: FrameMotion, levels: Tensor, length: int) 
     # less than 4 % of their power
     v = spectrum.v + torch.tensor([[0.0], [-1.0], [1.0]], dtype=spectrum.v.dtype, device=spectrum.v.device)
     blur, power = spectrum.blur(spectrum.u, v.flatten()).unflatten(-1, (3, -1)), kernel_spectrum(v).square()
-    transfer = smeared(blur[..., 0, :] * power[0])
+    transfer = blur[..., 0, :] * power[0]
     aliases: Tensor = (blur[..., 1:, :].mean(2) * power[1:]).sum(-2)
     observed, weight, noise = spectrum.weighted(transfer)
-    passed = (weight * transfer).sum((1, 2))
+    passed: Tensor = (weight * transfer).sum((1, 2))
     spectra = observed, passed, aliases, noise
     differentiable = torch.is_grad_enabled() and (observed.requires_grad or passed.requires_grad)
     fitted = autoregressive_prior(*spectra) if differentiable else autoregressive_prior(*tables(*spectra))
     power, first, second, interpolation = (torch.as_tensor(values, device=frames.device) for values in fitted)
     return RowPrior(power, torch.stack([first, second]), interpolation).resampled(length // 2 + 1)
-
-
-def smeared(transfer: Tensor) -> Tensor:
-    """Transfer function (..., U, V) of tapered pieces: the taper mixes neighbouring frequencies."""
-    count = transfer.shape[-2]
-    wide = transfer[..., mirrored(torch.arange(-1, count + 1, device=transfer.device), count), :]
-    return (2.0 / 3.0) * transfer + (1.0 / 6.0) * (wide[..., :-2, :] + wide[..., 2:, :])
 
 
 # rows solved side by side, each slab by itself: results differ by 0.03 dB at most from those of 128 rows
@@ -346,7 +339,6 @@ def sample_rows(images: Tensor, kernels: RowKernels, chosen: NDArray[np.int64]) 
 
 
 _STRENGTHS = np.array([1.0, 2.0, 4.0, 8.0, 16.0])  # factors on the prior
-_HANDICAP = 0.002  # of the logarithm of the score, per octave of a strength
 _FREQUENCIES = 16  # at which rows are sampled; 12 and 24 give the same results, 8 loses 0.4 dB in three cases of 61
 _ROWS = 512  # sampled, from the middle of the frames
 
@@ -367,25 +359,21 @@ def prior_strengths(
     if min(height, width) < 64:  # too few values for a choice
         return np.ones(len(images))
     # 1. Fits with the prior at all strengths, at frequencies from 0.02 cycles per px, below which the taper mixes them.
-    count = min(height, _ROWS)
-    top = (height - count) // 2
-    frequencies = min(_FREQUENCIES, width // 4)
+    rows, frequencies = min(height, _ROWS), min(_FREQUENCIES, width // 4)
+    top = (height - rows) // 2
     chosen = np.linspace(0.02 * width, width // 2, frequencies, dtype=np.float32).astype(np.int64)
-    sample = sample_rows(images[..., top : top + count, :], kernels.rows(top, count), chosen)
+    sample = sample_rows(images[..., top : top + rows, :], kernels.rows(top, rows), chosen)
     place = torch.from_numpy(np.rint(chosen / width * 2 * (prior.power.shape[-1] - 1)).astype(np.int64))
     scenes, members, number = *prior.interpolation_power.shape[:2], len(_STRENGTHS)
     at = RowPrior(*(values[..., place.to(values.device)] for values in vars(prior).values()))
-    of_all = at.of(torch.arange(scenes).repeat(number), torch.arange(members))
+    stacks, frames = (torch.arange(count, device=images.device) for count in (scenes, members))
+    of_all = at.of(stacks.repeat(number), frames)
     strength = torch.from_numpy(_STRENGTHS.repeat(scenes)[:, None]).to(noise_power)
     precisions = of_all.precision(noise_power.repeat(number, 1), strength, blur_reach.repeat(number, 1))
     power, rest = sample.unexplained(precisions)
     # 2. ``n |r|^2 / (n - freedom)^2`` of Craven and Wahba (1979) estimates the squared error of predicting a pixel from
-    # all others. The sum over the frequencies is dominated by those with the largest errors; the geometric mean gives
-    # all the same weight. The weaker of the two selected priors is used: with the mean alone, the ends of a grating
-    # lose 6 dB; with the sum alone, five of 124 restorations lose 0.2 to 2.8 dB.
-    with np.errstate(divide="ignore", invalid="ignore"):  # frames without content have no scores
-        of_sum = np.log(power.sum(-1)) - 2 * np.log(rest.sum(-1))
-        geometric = (np.log(power) - 2 * np.log(rest)).mean(-1)
-    handicap = _HANDICAP * np.log2(_STRENGTHS)[:, None]
-    selected = [without_nan(values + handicap, math.inf).argmin(0) for values in (of_sum, geometric)]
-    return _STRENGTHS[np.minimum(*selected)]
+    # all others. The geometric mean gives all frequencies the same weight: the sum, in which those with the largest
+    # errors dominate, lost 0.2 to 2.8 dB in five of 124 restorations.
+    with np.errstate(divide="ignore", invalid="ignore"):  # frames without content have no score
+        score = (np.log(power) - 2 * np.log(rest)).mean(-1)
+    return _STRENGTHS[without_nan(score, math.inf).argmin(0)]
