@@ -372,8 +372,11 @@ def prior_strengths(
     precisions = of_all.precision(noise_power.repeat(number, 1), strength, blur_reach.repeat(number, 1))
     power, rest = sample.unexplained(precisions)
     # 2. ``n |r|^2 / (n - freedom)^2`` of Craven and Wahba (1979) estimates the squared error of predicting a pixel from
-    # all others. The geometric mean gives all frequencies the same weight: the sum, in which those with the largest
-    # errors dominate, lost 0.2 to 2.8 dB in five of 124 restorations.
-    with np.errstate(divide="ignore", invalid="ignore"):  # frames without content have no score
-        score = (np.log(power) - 2 * np.log(rest)).mean(-1)
-    return _STRENGTHS[without_nan(score, math.inf).argmin(0)]
+    # all others. The sum over the frequencies is dominated by those with the largest errors; the geometric mean gives
+    # all the same weight. The weaker of the two selected priors is used: with the sum alone, five of 124 restorations
+    # lose 0.2 to 2.8 dB; with the mean alone, ten of 98 with white noise lose 0.1 to 0.9 dB.
+    with np.errstate(divide="ignore", invalid="ignore"):  # frames without content have no scores
+        of_sum = np.log(power.sum(-1)) - 2 * np.log(rest.sum(-1))
+        geometric = (np.log(power) - 2 * np.log(rest)).mean(-1)
+    selected = [without_nan(score, math.inf).argmin(0) for score in (of_sum, geometric)]
+    return _STRENGTHS[np.minimum(*selected)]
