@@ -54,7 +54,7 @@ INNER_LAYERS: dict[str, tuple[set[str], ...]] = {
     "report": ({"results", "plots"}, {"page"}),
     "restoration": (
         {"frame_motion", "observation", "restoration_verdict"},
-        {"scene_prior"},
+        {"frame_pairs", "scene_prior"},
         {"noise", "scene_solver"},
         {"finer_grid", "judge", "priors", "row_methods"},
         {"mosaic_scene"},

@@ -122,6 +122,7 @@ class PreparedFrames:
     # (B, T, 1, H, W), colour that each pixel of a mosaic measures: 0 red, 1 green, 2 blue; None for frames whose
     # pixels measure all channels
     colours: Tensor | None = None
+    lost: Tensor | None = None  # (B, T, H) bool, rows that were lost, which count as missing; None if there are none
 
     @property
     def batched(self) -> bool:
@@ -226,6 +227,11 @@ def prepare_frames(
     row_timing = timing.in_row_order()
     row_timing.check_rows(images.shape[-2])
     missing, saturated = (None if mask is None else in_row_order(mask) for mask in (missing, saturated))
+    lost = _lost_rows(images, missing)
+    if lost is not None:
+        of_rows = lost[:, :, None, :, None].expand(images.shape)
+        missing = of_rows if missing is None else missing | of_rows
+        images = images.masked_fill(of_rows, 0)
     colours = None
     if mosaic is not None:
         check_mosaic(mosaic, frames_from_row_order(images, timing).shape, name)
@@ -233,7 +239,7 @@ def prepare_frames(
         pattern = frames_to_row_order(colours_of(mosaic, *size), timing)
         colours = pattern.to(images.device).expand(images.shape)
     return PreparedFrames(
-        images, missing, saturated, row_timing, timing, tuple(given.shape), axis, dtype, full_scale, colours
+        images, missing, saturated, row_timing, timing, tuple(given.shape), axis, dtype, full_scale, colours, lost
     )
 
 
@@ -321,13 +327,46 @@ def _missing_pixels(frames: Tensor, ignore: object, allow_missing: bool, axis: i
 def _saturated_pixels(frames: Tensor, saturation: Saturation, full_scale: float | None) -> Tensor | None:
     """Mask of the pixels at the saturation level or above, in the unit of the user's frames; None if there are none."""
     if saturation == "auto":
-        saturation = None if frames.dtype.is_floating_point else 255.0 if full_scale is None else full_scale
+        saturation = None if frames.dtype.is_floating_point else _largest_count(frames, full_scale or 255.0)
     if saturation is None:
         return None
     mask = frames >= check_number("saturation", saturation, above=0.0)
     if bool(mask.all()):
         raise ValueError("every pixel is saturated")
     return mask if bool(mask.any()) else None
+
+
+def _largest_count(frames: Tensor, full_scale: float) -> float:
+    """The count that saturated pixels have: full scale, or the last multiple of the step of the counts up to it.
+
+    A camera of 12 bits, stored left-aligned in 16, has counts that are multiples of 16, of at most 65520.
+    """
+    counts = frames.to(torch.int32 if frames.dtype.itemsize < 4 else torch.int64)  # others have no bitwise operations
+    largest = int(counts.max())
+    step = largest & -largest  # the largest power of two that divides it
+    aligned = largest <= full_scale < largest + step and not bool((counts & (step - 1)).any())
+    return largest if aligned else full_scale
+
+
+# of the mean contrast of the rows of a frame, above which a row has detail: noise of a dark sky has less
+_LEAST_CONTRAST = 0.25
+
+
+def _lost_rows(images: Tensor, missing: Tensor | None) -> Tensor | None:
+    """(B, T, H) bool, rows of one value where half of the frames of the stack or more have detail; None for none.
+
+    They were lost on the way from the camera, unless most rows of a frame have one value.
+    """
+    if not bool((images[..., :8] == images[..., :1]).all(-1).any()):  # a fraction of the time of what follows
+        return None
+    low, high = images.aminmax(dim=-1)
+    contrast = (high - low).amax(2)
+    constant, has_detail = contrast == 0, contrast > _LEAST_CONTRAST * contrast.mean(-1, keepdim=True)
+    few = constant.float().mean(-1, keepdim=True) < 0.5
+    lost = constant & few & (has_detail.float().mean(1, keepdim=True) >= 0.5)
+    if missing is not None:
+        lost &= ~missing.all(-1).all(2)
+    return lost if bool(lost.any()) else None
 
 
 _LEAST_VALID = 0.1  # of the pixels of a frame

@@ -146,22 +146,14 @@ def row_transfer(taps: Tensor, along: Tensor, frequencies: Tensor) -> Tensor:
     return transfer.view(*taps.shape[:-1], -1)
 
 
-def form_rows(
-    spectra: Tensor,
-    places: Tensor,
-    along: Tensor,
-    node_weights: Tensor,
-    frequencies: Tensor,
-    degree: int,
-) -> Tensor:
+def form_rows(spectra: Tensor, first: Tensor, taps: Tensor, along: Tensor, frequencies: Tensor, degree: int) -> Tensor:
     """Form rows of frames from the spectra of the rows of a scene, which is mirrored beyond its first and last row.
 
     The ``spectra`` (..., 1, S, U) of one scene for all frames, or (..., T, S, U) of one for each of T frames, are those
-    of B-spline coefficients, of ``degree`` across the rows. ``places`` (T, R, N) are scene rows at the nodes of the
-    exposures of R rows, and ``along`` (T, R, N) displacements along the rows in px; ``node_weights`` (N,) sum to 1;
-    frequencies (U,) are in cycles per px. The rows are (..., T, R, U).
+    of B-spline coefficients, of ``degree`` across the rows. ``first`` (T, R) and ``taps`` are those of ``row_taps`` for
+    these B-splines, ``along`` (T, R, N) are displacements along the rows in px; frequencies (U,) are in cycles per px.
+    The rows are (..., T, R, U).
     """
-    first, taps = row_taps(places, node_weights, partial(bspline_weights, degree=degree))
     source = first[..., None] + torch.arange(-(degree // 2), taps.shape[-2] - degree // 2, device=first.device)
     scenes, rows = spectra.shape[-3:-1]
     source = mirrored(source, rows) + rows * torch.arange(scenes, device=first.device)[:, None, None]

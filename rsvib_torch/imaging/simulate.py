@@ -4,6 +4,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -12,13 +13,13 @@ from rsvib_torch.checks.arguments import ArrayLike, as_tensor, channels_appear_l
 from rsvib_torch.checks.values import Count, check_single
 from rsvib_torch.files.reading import check_fits
 from rsvib_torch.frames.prepare import frames_from_row_order, frames_to_row_order
-from rsvib_torch.imaging.blur import form_rows
+from rsvib_torch.imaging.blur import form_rows, row_taps
 from rsvib_torch.imaging.sensor_model import SensorNoise
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.motion.camera import largest_in_frame, largest_slope
 from rsvib_torch.motion.motion import ColumnMotion, ColumnStrips, Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
-from rsvib_torch.numerics.interpolation import bspline_coefficients, extend_rows, fast_length
+from rsvib_torch.numerics.interpolation import bspline_coefficients, bspline_weights, extend_rows, fast_length
 
 _DEGREE = 9  # degree of the spline across rows; its error is 2e-5 of the amplitude at a quarter cycle per pixel
 # px between the visible part and the edge of the scene; the prefilter of the spline decays to 4e-4 within it
@@ -155,6 +156,7 @@ def _form_rows(scene: Tensor, starts: Tensor, timing: RowTiming, motion: Motion,
     for chunk in torch.arange(num_rows, device=scene.device).split(_CHUNK_ROWS):
         displacement, node_weights = exposure_trajectory(motion, starts[:, chunk], timing, "gauss")
         places = top + chunk[:, None] - displacement[..., 1]
-        row_spectra = form_rows(spectra, places, displacement[..., 0], node_weights, frequencies, _DEGREE)
+        first, taps = row_taps(places, node_weights, partial(bspline_weights, degree=_DEGREE))
+        row_spectra = form_rows(spectra, first, taps, displacement[..., 0], frequencies, _DEGREE)
         formed.append(torch.fft.irfft(row_spectra, n=length)[..., left : left + width])
     return torch.cat(formed, dim=-2).movedim(-3, 0).contiguous()  # frames before channels

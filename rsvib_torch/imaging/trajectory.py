@@ -106,12 +106,12 @@ def rows_and_displacement(
     for iteration in range(8):
         starts = frame_start[..., None] + (rows[..., None] + near) * timing.row_time
         before, displacement, after = vibration.mean_displacement(starts, timing.exposure_time).unbind(-2)
+        slope = (after - before) / 2e-3
         # the limit keeps steps finite near slope 1
-        remaining = (1.0 - (after - before)[..., 1].detach() / 2e-3).clamp(min=0.1)
-        step = (scene_rows + displacement[..., 1] - rows) / remaining
-        rows = rows + step
-        # a step of 1e-5 px would be followed by one of its square, far below any measurement
-        if iteration > 0 and bool((step.abs() < 1e-5).all()):
+        step = (scene_rows + displacement[..., 1] - rows) / (1.0 - slope[..., 1].detach()).clamp(min=0.1)
+        rows, displacement = rows + step, displacement + slope * step[..., None]
+        # a step of 1e-3 px would be followed by less than its square, far below any measurement
+        if iteration > 0 and bool((step.abs() < 1e-3).all()):
             break
     return rows, displacement
 

@@ -45,6 +45,7 @@ from rsvib_torch.restoration.scene_solver import (
     with_missing_values,
 )
 
+_LEAST_MEASURED = 0.05  # share of the pixels of a frame that contributes
 _FRAME_BYTES = 2**26  # frames of scenes that are treated at a time on a CPU, beside the systems
 
 
@@ -105,12 +106,12 @@ class FrameModel(MovingFrames):
 
     weights: Tensor  # (B, T) weights of the frames
     level: Tensor  # (B,) standard deviation of the noise of a frame of weight 1
-    level_is_certain: bool  # whether it is given or estimated from several frames
     mean: Tensor  # (B, C, 1, 1) brightness; the prior is for deviations from it
     prior: RowPrior | list[PolynomialPrior]  # of all frames; on the finer grid, one for each stack
     period: int  # L, the period of the restored scenes in px
     scale: int  # points of the restored scenes per px
     unknown: Tensor | None  # (B, T, C, H, W) bool, pixels without data and saturated ones; None for none
+    measured: NDArray[np.float64]  # (B, T) share of the pixels that are not unknown
 
     def scenes(self, groups: list[tuple[list[int], int]]) -> Scenes:
         """The scenes that are restored from groups of frames (``joint_groups``), stack after stack."""
@@ -120,11 +121,9 @@ class FrameModel(MovingFrames):
         reference = np.tile([[reference] for _, reference in groups], (count, 1))
         shift = table(self.motion.shift)
         blur_reach = 0.5 * self.motion.blur_lengths[stack, members, 0].max(1)
-        measured = np.ones(members.shape)
-        if self.unknown is not None:
-            measured = 1.0 - table(self.unknown.double().flatten(2).mean(2))[stack, members]
-        # frames with at most 5 % measured pixels do not contribute, unless there are no others
-        contributes = measured > 0.05
+        measured = self.measured[stack, members]
+        # frames with few measured pixels do not contribute, unless there are no others
+        contributes = measured > _LEAST_MEASURED
         contributes |= ~contributes.any(1, keepdims=True)
         moved = shift[stack, members] - shift[stack, reference]
         complete = (measured == 1).all(1)
@@ -168,7 +167,6 @@ class FrameModel(MovingFrames):
                 self.prior.of(stack_of[:, 0], member_of),
                 self.level[stack_of].square(),
                 torch.as_tensor(some.blur_reach[:, None], device=self.images.device),
-                certain=self.level_is_certain,
             )
             strengths.append(found)
         result: NDArray[np.float64] = np.concatenate(strengths)[of_scenes]
@@ -237,16 +235,18 @@ def model_frames(given: MovingFrames, *, noise: float | Literal["auto"] = "auto"
     if noise == "auto":
         chosen = sorted({strips // 4, strips - 1 - strips // 4})
         parts = [first + strip for first in range(0, B, strips) for strip in chosen]
-        measured = noise_levels(frames[parts], motion.of(parts), None if unknown is None else unknown[parts])
-        powers = measured.square().unflatten(0, (-1, len(chosen))).mean(1).repeat_interleave(strips, 0)
+        estimated = noise_levels(frames[parts], motion.of(parts), None if unknown is None else unknown[parts])
+        powers = estimated.square().unflatten(0, (-1, len(chosen))).mean(1).repeat_interleave(strips, 0)
     else:
         powers = frames.new_full((B, T), noise**2)
     powers = powers.clamp(min=MIN_LEVEL**2)
     frame_weights = powers.reciprocal()
     unit_variance = frame_weights.mean(1).reciprocal()
 
-    # Prior, fitted to the frames.
-    levels, period = powers.sqrt(), scene_period(motion, W)
+    # Prior, fitted to the frames that contribute: an empty one would make it too strong, by 0.4 dB beside two others.
+    measured = np.ones((B, T)) if unknown is None else 1.0 - table(unknown.double().flatten(2).mean(2))
+    few = torch.from_numpy((measured <= _LEAST_MEASURED) & (measured > _LEAST_MEASURED).any(1, keepdims=True))
+    levels, period = powers.sqrt().masked_fill(few.to(powers.device), math.inf), scene_period(motion, W)
     prior: RowPrior | list[PolynomialPrior]
     if scale == 1:
         prior = fit_prior(frames, motion, levels, period)
@@ -257,12 +257,12 @@ def model_frames(given: MovingFrames, *, noise: float | Literal["auto"] = "auto"
         **vars(given),
         weights=frame_weights * unit_variance[:, None],
         level=unit_variance.sqrt(),
-        level_is_certain=noise != "auto" or T > 1,
         mean=brightness(frames).mean(1)[..., None, None],
         prior=prior,
         period=period,
         scale=scale,
         unknown=unknown,
+        measured=measured,
     )
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from rsvib_torch.numerics.interpolation import squared_modulus
 from rsvib_torch.restoration.frame_motion import FrameMotion, warn_of_restoration
 from rsvib_torch.restoration.observation import SCALE, kernel_spectrum
-from rsvib_torch.restoration.scene_prior import observed_spectrum, smeared
+from rsvib_torch.restoration.scene_prior import observed_spectrum
 from rsvib_torch.restoration.scene_solver import SceneProblem
 
 # Degree 6 instead of 4: 0.6 to 1.0 dB for eight frames of scenes with little detail beyond half a cycle per px, -0.4 dB
@@ -89,7 +89,7 @@ def fit_polynomial_prior(frames: Tensor, motion: FrameMotion, levels: Tensor, le
     """
     spectrum = observed_spectrum(frames, motion, levels, length)
     u, v = spectrum.u[:, None], spectrum.v
-    transfer = smeared(spectrum.blur(spectrum.u, spectrum.v))
+    transfer = spectrum.blur(spectrum.u, spectrum.v)
     observed, weight, noise = (values[0] for values in spectrum.weighted(transfer))
     # transfer function and powers of the Laplacians at each alias
     gains, features = [], []
@@ -98,7 +98,7 @@ def fit_polynomial_prior(frames: Tensor, motion: FrameMotion, levels: Tensor, le
         for alias_v in (-1, 0, 1):
             beyond = (v - alias_v).abs() > 1
             along, across = u - alias_u, (v - alias_v).clamp(-1, 1)
-            blur = smeared(spectrum.blur(spectrum.u - alias_u, spectrum.v - alias_v))[0]
+            blur = spectrum.blur(spectrum.u - alias_u, spectrum.v - alias_v)[0]
             blur = (weight * blur).sum((0, 1)).masked_fill(beyond, 0.0)
             gains.append(blur * _pixel(along) * kernel_spectrum(across, SCALE).square())
             rows = _laplacian(across)[:, None] ** order @ rising.T

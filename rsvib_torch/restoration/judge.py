@@ -8,33 +8,33 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn import functional
 
 from rsvib_torch.checks.arguments import ArrayLike, Channels, FramesOrFiles, as_tensor, checks_arguments
 from rsvib_torch.checks.values import check_whole_number
 from rsvib_torch.execution.parallel import at_once, runs
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.entry_points import load_frames
-from rsvib_torch.frames.pixels import cut_columns, cut_parts, detailed_parts
+from rsvib_torch.frames.pixels import detailed_parts
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames, reasons_from_row_order
-from rsvib_torch.imaging.blur import form_rows
 from rsvib_torch.motion.detected_vibration import DetectedVibration
-from rsvib_torch.motion.motion import ColumnMotion, Motion
+from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.numerics.interpolation import correlated, extended_length, spline_spectra
-from rsvib_torch.numerics.tables import Array, table, tables, take_stacks, valid_mean, without_nan
-from rsvib_torch.restoration.frame_motion import (
-    FrameMotion,
-    frame_motion,
-    joint_groups,
-    motion_of_frames,
-    vibration_to_undo,
+from rsvib_torch.numerics.tables import Array, table, take_stacks, valid_mean, without_nan
+from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups, motion_of_frames, vibration_to_undo
+from rsvib_torch.restoration.frame_pairs import (
+    CommonParts,
+    JudgedFrames,
+    common_parts,
+    cut_pairs,
+    equally_bright,
+    judged_strip,
+    mean_places,
+    misfit,
 )
 from rsvib_torch.restoration.noise import noise_deviation
 from rsvib_torch.restoration.restoration_verdict import (
@@ -47,16 +47,20 @@ from rsvib_torch.restoration.restoration_verdict import (
 from rsvib_torch.results.reason import Reason
 
 _MAX_MISSING = 0.5  # share of the pixels of a pair without data, above which it is not judged
-_STRIP = 160  # px, width of the strip of columns that is judged with roll or zoom: enough for the means of a pair
 _MIN_NOISE = 1e-5  # of full scale; noise level assumed at least, rounding of float32 images
-_SMOOTHING = 5.0  # px, standard deviation of the Gaussian in ``misfit``; displacements of up to about 10 px stay linear
-_RIM = math.ceil(3 * _SMOOTHING) + 1  # px; half width of the kernels of ``misfit``
-_NEAR = 8  # px around missing pixels within which the restored frame is a guess
-_MARGIN = 4  # px between the compared pixels and those outside the frame
 
 
 class TooLittleInCommonError(ValueError):
     """Two frames share too little of the scene to be compared."""
+
+
+class PairVerdict(NamedTuple):
+    """Verdict on one pair of frames, in row order."""
+
+    levels: Array  # (5,), ``LEVELS``
+    displacements: Array  # (3, 2), ``DISPLACEMENTS``
+    outcome: Outcome
+    reasons: tuple[Reason, ...]
 
 
 @checks_arguments
@@ -152,10 +156,10 @@ def judge_prepared(
     most_pairs: int | None = None,
 ) -> RestorationVerdict:
     """``judge_restoration`` of one stack of prepared frames; restored ones (1, T, C, H, W) are in row order."""
-    (verdict,) = judge_stacks(frames, restored, motion_of_frames(frames, vibration), joint=joint, most_pairs=most_pairs)
-    if isinstance(verdict, TooLittleInCommonError):
-        raise verdict
-    return verdict
+    (pairs,) = judge_stacks(frames, restored, motion_of_frames(frames, vibration), joint=joint, most_pairs=most_pairs)
+    if isinstance(pairs, TooLittleInCommonError):
+        raise pairs
+    return verdict_on_stack(pairs, frames.image_timing, restored.device)
 
 
 @torch.no_grad()
@@ -168,26 +172,26 @@ def judge_stacks(
     joint: bool | int = False,
     most_pairs: int | None = None,
     columns: int | None = None,
-) -> list[RestorationVerdict | TooLittleInCommonError]:
-    """Verdicts on some stacks of a batch, or errors if two frames have too little in common.
+) -> list[list[PairVerdict] | TooLittleInCommonError]:
+    """Verdicts on the pairs of some stacks of a batch, or errors if two frames have too little in common.
 
-    Restored frames (B, T, C, H, W), or (B, 1, C, H, W), are in row order, verdicts in image axes. Only the ``columns``
-    with the most detail are used.
+    Restored frames (B, T, C, H, W), or (B, 1, C, H, W), are in row order. Only the ``columns`` with the most detail are
+    used.
     """
     # 1. The pairs of frames of all stacks, and what they have in common.
     most = None if most_pairs is None else check_whole_number("most_pairs", most_pairs, at_least=1)
     pairs = pairs_to_judge(motion.shift.shape[1], joint, most)
     dtype = torch.promote_types(frames.images.dtype, restored.dtype)
     raw, still = (images.to(dtype) for images in frames.compared(restored))
-    given = _judged_strip(_JudgedFrames(raw, still, frames.missing, motion))
+    given = judged_strip(JudgedFrames(raw, still, frames.missing, motion))
     numbers = np.array([(stack, *pair) for stack in stacks for pair in pairs], np.int64).reshape(-1, 3)
     detailed = None if columns is None else detailed_parts(given.images, columns)
-    common = _common_parts(given.motion, numbers, given.images.shape[-2:])
+    common = common_parts(given.motion, numbers, given.images.shape[-2:])
 
     # 2. Pairs whose common parts have the same size are judged together, as many as the memory allows.
     shared = len(joint_groups(raw.shape[1], joint)[0][0])  # frames from which one image is restored
-    advance = steps(len(numbers), "pairs of frames")
-    judged: dict[int, _PairVerdict] = {}
+    advance = steps(int(common.is_enough.sum()), "pairs of frames")
+    judged: dict[int, PairVerdict] = {}
     sizes, group = np.unique(np.concatenate([common.size, common.rim], 1), axis=0, return_inverse=True)
     for number, size in enumerate(sizes):
         members = np.flatnonzero(common.is_enough & (group == number))
@@ -198,10 +202,9 @@ def judge_stacks(
             judged |= zip(some.tolist(), verdicts_of_pairs, strict=True)
             advance(len(some))
 
-    # 3. One verdict for all pairs of a stack, in image axes.
-    verdicts: list[RestorationVerdict | TooLittleInCommonError] = []
-    for first in range(0, len(numbers), len(pairs)):
-        of_stack = range(first, first + len(pairs))
+    # 3. The verdicts on all pairs of each stack.
+    verdicts: list[list[PairVerdict] | TooLittleInCommonError] = []
+    for of_stack in np.arange(len(numbers)).reshape(-1, len(pairs)).tolist():
         apart = [number for number in of_stack if number not in judged]
         if apart:
             (earlier, later), (down, right) = common.frames[apart[0]], common.step[apart[0]]
@@ -212,19 +215,22 @@ def judge_stacks(
                     f"px apart, in frames of {width} x {height} px whose rows move"
                 )
             )
-            continue
-        levels, displacements, outcomes, reasons = zip(*(judged[number] for number in of_stack), strict=True)
-        moved = torch.from_numpy(np.stack(displacements, 1)).to(raw.device)  # (3, P, 2)
-        moved = moved.flip(-1) if frames.image_timing.scan_axis == -1 else moved
-        of_levels = torch.tensor(np.array(levels), dtype=torch.float64, device=raw.device).unbind(-1)
-        verdict = RestorationVerdict(
-            **dict(zip(LEVELS, of_levels, strict=True)),
-            **dict(zip(DISPLACEMENTS, moved, strict=True)),
-            outcome=outcomes,
-            findings=tuple(reasons_from_row_order(of_pair, frames.image_timing) for of_pair in reasons),
-        )
-        verdicts.append(verdict)
+        else:
+            verdicts.append([judged[number] for number in of_stack])
     return verdicts
+
+
+def verdict_on_stack(pairs: list[PairVerdict], timing: SensorTiming, device: torch.device) -> RestorationVerdict:
+    """One verdict from those on all pairs of a stack, in image axes."""
+    levels, displacements, outcomes, reasons = zip(*pairs, strict=True)
+    moved = torch.from_numpy(np.stack(displacements, 1)).to(device)  # (3, P, 2)
+    moved = moved.flip(-1) if timing.scan_axis == -1 else moved
+    return RestorationVerdict(
+        **dict(zip(LEVELS, torch.from_numpy(np.stack(levels, 1)).to(device), strict=True)),
+        **dict(zip(DISPLACEMENTS, moved, strict=True)),
+        outcome=outcomes,
+        findings=tuple(reasons_from_row_order(of_pair, timing) for of_pair in reasons),
+    )
 
 
 def pairs_to_judge(count: int, joint: bool | int, most: int | None = None) -> list[tuple[int, int]]:
@@ -238,189 +244,20 @@ def pairs_to_judge(count: int, joint: bool | int, most: int | None = None) -> li
     return [pairs[index] for index in np.rint(np.linspace(0, len(pairs) - 1, most)).astype(int)]
 
 
-@dataclass(frozen=True, eq=False)
-class _JudgedFrames:
-    """Raw frames of B stacks in row order, and the frames restored from them."""
-
-    images: Tensor  # (B, T, C, H, W)
-    restored: Tensor  # likewise, or (B, 1, C, H, W) in the coordinates of the earlier frame of each pair
-    missing: Tensor | None  # (B, T, C, H, W) bool, pixels without data
-    motion: FrameMotion
-
-
-def _judged_strip(given: _JudgedFrames) -> _JudgedFrames:
-    """The part of the frames by which their restoration is judged.
-
-    With roll or zoom, this is a strip of columns: of those in the middle of both halves, the one with more detail.
-    """
-    motion, (height, width) = given.motion, given.images.shape[-2:]
-    if motion.vibration.same_for_all_columns:
-        motion.check_fits(width)
-        return given
-    strip = min(_STRIP, width // 2)
-    halves = [slice(middle - strip // 2, middle - strip // 2 + strip) for middle in (width // 4, width - width // 4)]
-    both = torch.cat([given.images[:, :1, ..., half] for half in halves], -1)
-    chosen = [halves[0 if detailed.start < strip // 2 else 1] for detailed in detailed_parts(both, strip)]
-    middles = [half.start + 0.5 * (strip - width) for half in chosen]
-    columns = torch.tensor(middles, dtype=torch.float64, device=both.device)
-    starts = tuple(motion.frame_starts.tolist())
-    of_strips = ColumnMotion(motion.vibration, columns, starts, motion.timing.row_time, height)
-    return _JudgedFrames(
-        cut_columns(given.images, chosen),
-        cut_columns(given.restored, chosen),
-        None if given.missing is None else cut_columns(given.missing, chosen),
-        frame_motion(of_strips, motion.timing, motion.frame_starts, height),
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class _CommonParts:
-    """What N pairs of frames have in common."""
-
-    stack: NDArray[np.int64]  # (N,)
-    frames: NDArray[np.int64]  # (N, 2) the earlier and the later one
-    moves: NDArray[np.bool_]  # (N, 2) whether the axis (x, y) moves in this stack
-    step: NDArray[np.int64]  # (N, 2) displacement (y, x) in whole px of the content from the earlier to the later frame
-    size: NDArray[np.int64]  # (N, 2) rows and columns of the part
-    rim: NDArray[np.int64]  # (N, 2) rows and columns at its ends that are not compared
-
-    @property
-    def is_enough(self) -> NDArray[np.bool_]:
-        """(N,) whether the compared part is larger than the filters."""
-        enough: NDArray[np.bool_] = (self.size - 2 * self.rim).min(1) >= 2 * _RIM + 3
-        return enough
-
-
-def _common_parts(motion: FrameMotion, pairs: NDArray[np.int64], shape: torch.Size) -> _CommonParts:
-    """Common parts of pairs (N, 3) of a stack, an earlier and a later frame of it, in frames of a shape."""
-    stack, frames, extent = pairs[:, 0], pairs[:, 1:], np.array(shape)
-    # rows are displaced by so much beyond the content of their frame, axes (y, x)
-    moved = _mean_places(motion)
-    shift, reach = (values[stack[:, None], frames][..., ::-1] for values in tables(motion.shift, moved.abs().amax(-2)))
-    step = (shift[:, 1] - shift[:, 0]).astype(np.int64)
-    # sizes change in steps, so that many pairs have the same
-    unit = np.clip(extent // 32, _MARGIN, 4 * _MARGIN)
-    rim = np.ceil((reach.max(1) + _MARGIN) / unit).astype(np.int64) * unit
-    size = extent + -abs(step) // unit * unit
-    return _CommonParts(stack, frames, np.array(motion.bounds)[stack, :2] > 0, step, size, rim)
-
-
-def _mean_places(motion: FrameMotion) -> Tensor:
-    """Mean displacement (B, T, R, 2) in px of every row during its exposure, beyond the shift of its frame."""
-    displacement, node_weights = motion.exposures
-    return (displacement * node_weights[:, None]).sum(-2) - motion.shift[:, :, None]
-
-
-@dataclass(frozen=True, eq=False)
-class FramePairs:
-    """The common parts of N pairs of raw frames and of their restored frames, (N, C, h, w) each."""
-
-    earlier: Tensor  # raw
-    later: Tensor  # raw
-    restored: Tensor  # restored from the earlier frame, or the one image of all frames
-    restored_later: Tensor | None  # restored from the later frame; None where there is one image
-    predicted: Tensor  # the later raw frame, formed from ``restored``
-    changed_later: Tensor  # change of the restored later frame by the motion of that frame
-    # (N, 2, C, h, w) bool, pixels of the raw frames without data; they hold the values that the restored frames predict
-    missing: Tensor | None
-
-
-def _cut_pairs(given: _JudgedFrames, common: _CommonParts, detailed: list[slice] | None) -> FramePairs:
-    """Cut pairs of frames to their common parts, which have one size; rows are those of the later frame.
-
-    Of the columns, the ``detailed`` ones of each stack are kept; None for all.
-    """
-    (height, width), (rim_y, rim_x) = common.size[0].tolist(), common.rim[0].tolist()
-    (earlier, later), single = common.frames.T, given.restored.shape[1] == 1
-    first, second = (-common.step).clip(0), common.step.clip(0)  # row and column of the part in both frames
-
-    def cut(images: Tensor, frame: NDArray[np.int64], place: NDArray[np.int64]) -> Tensor:
-        return cut_parts(images, (common.stack, frame), place[:, 0], place[:, 1], (height, width))
-
-    # 1. Columns with the most detail, which lie in the part.
-    if detailed is not None:
-        part_width, width = width, min(width, detailed[0].stop - detailed[0].start + 2 * rim_x)
-        starts = np.array([columns.start for columns in detailed])[common.stack] - rim_x
-        inside = np.clip(starts, second[:, 1], second[:, 1] + part_width - width) - second[:, 1]
-        first[:, 1] += inside
-        second[:, 1] += inside
-    # 2. Both restored frames with the motion of the later frame.
-    raw, raw_later = cut(given.images, earlier, first), cut(given.images, later, second)
-    still = cut(given.restored, np.zeros_like(earlier) if single else earlier, first)
-    still_later = still if single else cut(given.restored, later, second)
-    both = torch.stack([still, still_later], 1)
-    predicted, formed_later = reblur(both, given.motion, common.stack, later, second[:, 0]).unbind(1)
-    # 3. Predicted values at missing pixels, and the part that is compared.
-    inner = (..., slice(rim_y, height - rim_y), slice(rim_x, width - rim_x))
-    missing, compared_later = None, still_later
-    if given.missing is not None:
-        missing = torch.stack([cut(given.missing, earlier, first), cut(given.missing, later, second)], 1)
-        of_earlier = reblur(still[:, None], given.motion, common.stack, earlier, first[:, 0])[:, 0]
-        raw = torch.where(missing[:, 0], of_earlier, raw)
-        # what was restored near missing pixels of the earlier frame is a guess, which the later frame does not confirm
-        near = functional.max_pool2d(missing[:, 0].to(raw.dtype), 2 * _NEAR + 1, 1, _NEAR) > 0
-        raw_later = torch.where(missing[:, 1] | (near & (not single)), predicted, raw_later)
-        compared_later = torch.where(near, still, still_later)
-        missing = missing[inner]
-    return FramePairs(
-        raw[inner],
-        raw_later[inner],
-        still[inner],
-        None if single else compared_later[inner],
-        predicted[inner],
-        (formed_later - still_later)[inner],
-        missing,
-    )
-
-
-def reblur(
-    scenes: Tensor,
-    motion: FrameMotion,
-    stack: NDArray[np.int64],
-    frame: NDArray[np.int64],
-    first_row: NDArray[np.int64],
-) -> Tensor:
-    """Form frames of stacks from restored scenes (N, ..., h, w) (Eq. 9), independently of the restoration method.
-
-    Scenes are in row order, in the coordinates in which the frame (N,) of the stack (N,) is restored, and their row 0
-    is ``first_row`` (N,) of that frame; they may be a part of the rows and columns, and are mirrored beyond.
-    """
-    # displacement of each row during its exposure
-    degree, (height, width) = 5, scenes.shape[-2:]
-    displacement, node_weights = motion.exposures
-    members = displacement[stack[:, None], frame[:, None], first_row[:, None] + np.arange(height)]
-    along, across = (members - motion.shift[stack, frame][:, None, None]).unbind(-1)
-    place = torch.arange(height, device=scenes.device)[:, None] - across
-    low, high = place.aminmax(dim=-1)
-    reach, blur = torch.stack([along.abs().amax(), (high - low).amax()]).tolist()
-    # spectra of the spline coefficients (..., N, h, U), and a few rows of the frames at a time
-    length = extended_length(width, math.ceil(reach))
-    u = torch.fft.rfftfreq(length, dtype=scenes.dtype, device=scenes.device)
-    spectra, along = spline_spectra(scenes.movedim(0, -3), degree, length), along.to(scenes.dtype)
-    step = at_once(16 * (degree + 1 + math.ceil(blur)) * len(u) * len(scenes), scenes.device)
-    formed = [
-        form_rows(spectra, place[:, part], along[:, part], node_weights, u, degree) for part in runs(height, step)
-    ]
-    return torch.fft.irfft(torch.cat(formed, dim=-2), n=length)[..., :width].movedim(-3, 0)
-
-
 def _mean(values: Tensor) -> Tensor:
     """Mean (N,) over the pixels of N pairs (N, C, h, w)."""
     return values.mean((1, 2, 3), dtype=torch.float64)
 
 
-_PairVerdict = tuple[Array, Array, Outcome, tuple[Reason, ...]]  # ``LEVELS``, ``DISPLACEMENTS`` (3, 2), the rest
-
-
 def _judge_pairs(
-    given: _JudgedFrames, common: _CommonParts, shared: int, detailed: list[slice] | None
-) -> list[_PairVerdict]:
+    given: JudgedFrames, common: CommonParts, shared: int, detailed: list[slice] | None
+) -> list[PairVerdict]:
     """Verdicts on pairs of frames in row order, whose common parts have one size.
 
     ``shared`` are the frames from which one image is restored.
     """
     # 1. Noise of the raw frames; frames that differ in brightness are made equal.
-    pairs = _cut_pairs(given, common, detailed)
+    pairs = cut_pairs(given, common, detailed)
     raw = torch.stack([pairs.earlier, pairs.later], 1)
     noise = valid_mean(np.square(noise_deviation(raw, pairs.missing)).reshape(len(raw), -1), 1)
     noise = np.maximum(without_nan(noise, 0.0), _MIN_NOISE**2)
@@ -436,7 +273,7 @@ def _judge_pairs(
     # 3. Means over the pixels, which are transferred together. The noise of two restored frames is independent and
     # vanishes in the product of the changes of the scene by the motion.
     later = pairs.restored if pairs.restored_later is None else pairs.restored_later
-    moved = _mean_places(given.motion)[common.stack[:, None], common.frames].diff(dim=1)[:, 0]  # (N, R, 2)
+    moved = mean_places(given.motion)[common.stack[:, None], common.frames].diff(dim=1)[:, 0]  # (N, R, 2)
     means = [
         _mean((pairs.later - pairs.earlier).square()),
         _mean((later - pairs.restored).square()),
@@ -456,7 +293,7 @@ def _judge_pairs(
     gain = 10.0 * np.log10((change.clip(0.0) + noise) / error.clip(_MIN_NOISE**2))
 
     # 5. The outcomes; a gain of the opposite sign is not stated.
-    verdicts: list[_PairVerdict] = []
+    verdicts: list[PairVerdict] = []
     levels = np.stack([np.sqrt(before), np.sqrt(after), np.sqrt(noise), unexplained / noise, gain], 1)
     for n, (one, moves, between) in enumerate(zip(displacements, common.moves, np.stack(offset, 1), strict=True)):
         single = pairs.restored_later is None
@@ -474,78 +311,5 @@ def _judge_pairs(
             levels[n, -1] = math.nan
         if missing[n] > _MAX_MISSING:
             outcome, reasons = "unknown", (Reason("pixels_missing", None, float(missing[n]), _MAX_MISSING),)
-        verdicts.append((levels[n], one, outcome, reasons))
+        verdicts.append(PairVerdict(levels[n], one, outcome, reasons))
     return verdicts
-
-
-def equally_bright(pairs: FramePairs, noise: Tensor) -> FramePairs:
-    """The pairs with the earlier frame, and the images made of it, at the brightness and contrast of the later one.
-
-    Gain and offset are the regression of the later frame on the predicted one, from means over squares of 16 px, which
-    are large beside residual displacements. The ``noise`` power (N,) draws the gain towards 1. Frames that contradict
-    each other keep their brightness.
-    """
-    side = min(16, *pairs.later.shape[-2:])
-    both = torch.stack([pairs.predicted, pairs.later]).flatten(0, 1)
-    means = functional.avg_pool2d(both, side).flatten(2).double().unflatten(0, (2, -1))  # (2, N, C, n)
-    mean, target = means.mean(-1).unbind()
-    predicted, later = means - means.mean(-1, keepdim=True)
-    slope = ((predicted * later).mean((1, 2)) + noise) / (predicted.square().mean((1, 2)) + noise)
-    agrees = slope > 0
-    offset = torch.where(agrees[:, None], target - slope[:, None] * mean, 0.0).to(pairs.later.dtype)[..., None, None]
-    gain = torch.where(agrees, slope, 1.0).to(pairs.later.dtype)[:, None, None, None]
-    adjusted = {
-        name: torch.addcmul(offset, getattr(pairs, name), gain) for name in ("earlier", "restored", "predicted")
-    }
-    changed = gain * pairs.changed_later if pairs.restored_later is None else pairs.changed_later
-    return replace(pairs, **adjusted, changed_later=changed)
-
-
-def misfit(first: Tensor, second: Tensor) -> tuple[Array, Array]:
-    """Root-mean-square displacement between two images (..., C, H, W) of one scene along each axis, and its resolution.
-
-    A displacement d changes brightness by ``d . grad f``, so that the mean squared difference is ``a + dx^2 fx^2 + dy^2
-    fy^2 + 2 dx dy fx fy``; white noise raises ``a`` only. Both images are smoothed, so that this holds for
-    displacements up to about 10 px, and weighted least squares gives the means of dx^2 and dy^2. Images have at least
-    35 px on a side. The results (..., 2) are in px, axes (x, y), float64; a misfit below the resolution cannot be
-    distinguished from zero. They are 0 and infinity for images without contrast.
-    """
-    step = 4  # px between the places that are used, as neighbours are nearly equal
-    # Gaussian and its derivative; gradients of the mean image, and the smoothed difference
-    place = np.arange(-_RIM, _RIM + 1)
-    gaussian = np.where(abs(place) < _RIM, np.exp(-0.5 * (place / _SMOOTHING) ** 2), 0.0)
-    gaussian = gaussian / gaussian.sum()
-    taps = np.stack([gaussian, 0.5 * (np.roll(gaussian, 1) - np.roll(gaussian, -1))])
-    kernels = torch.as_tensor(taps, dtype=first.dtype, device=first.device)
-    images = torch.stack([0.5 * (first + second), second - first])
-    filtered = correlated(correlated(images, kernels, -1, step), kernels, -2, step)  # (across, along, image, ...)
-    # along: Gaussian across and its derivative along the rows, of the mean image; across likewise; change: smoothed
-    maps = filtered.flatten(0, 2)[[0b010, 0b100, 0b001]].flatten(-3).to(torch.float64)
-    along, across, change = maps.unbind()
-    # normal equations of weighted least squares for the four terms
-    tiny = torch.finfo(torch.float64).tiny
-    terms = [torch.ones_like(along), along.square(), across.square(), 2 * along * across]
-    energy = terms[1] + terms[2]
-    weight = (energy + energy.mean(-1, keepdim=True)).square().clamp(min=tiny).reciprocal()
-    data = torch.stack([*terms, change.square()], -2)
-    weighted = data[..., :4, :] * weight[..., None, :]
-    largest = torch.maximum(first.abs().amax((-3, -2, -1)), second.abs().amax((-3, -2, -1)))
-    data = torch.cat([data, weighted], -2)
-    products, strongest, brightest = tables(
-        torch.bmm(weighted.flatten(0, -3), data.flatten(0, -3).mT), energy.amax(-1), largest
-    )
-    normal, right, scatter = np.split(products.reshape(*strongest.shape, *products.shape[1:]), (4, 5), -1)
-    # small tables on the CPU; those of images without contrast may overflow
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        scale = np.maximum(np.diagonal(normal, axis1=-2, axis2=-1), tiny) ** -0.5
-        scale = scale[..., None, :] * scale[..., None]
-        inverse = np.linalg.pinv(normal * scale, hermitian=True) * scale
-        solution = (inverse @ right)[..., 0]
-        # the variance of a squared Gaussian is twice the square of its mean; values within the smoothing are correlated
-        correlated_values = 4 * math.pi * (_SMOOTHING / step) ** 2
-        scatter = scatter * (correlated_values * 2.0 * solution[..., :1, None] ** 2)
-        variance = np.diagonal(inverse @ scatter @ inverse, axis1=-2, axis2=-1)[..., 1:3].clip(0.0)
-    size, resolution = solution[..., 1:3].clip(0.0) ** 0.5, (2.0 * variance**0.5) ** 0.5
-    # rounding is no contrast
-    has_contrast = (np.sqrt(strongest) > 1e-5 * brightest)[..., None]
-    return np.where(has_contrast, size, 0.0), np.where(has_contrast, resolution, math.inf)

@@ -1,14 +1,12 @@
-"""Noise level of every frame of a stack: three estimators, and the order in which they are preferred.
+"""Noise level of every frame of a stack.
 
 ``noise_levels`` (at the end of the file) is the entry. ``estimate_noise`` measures single images and counts fine
-texture as noise; the other estimators separate noise from texture by a second frame, or by the floor of the power
-spectrum.
+texture as noise; a second frame separates noise from texture.
 
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
-from collections.abc import Sequence
 from statistics import NormalDist
 
 import numpy as np
@@ -18,30 +16,10 @@ from torch import Tensor
 
 from rsvib_torch.execution.parallel import at_once, runs
 from rsvib_torch.frames.pixels import cut_parts
-from rsvib_torch.numerics.interpolation import squared_modulus
 from rsvib_torch.numerics.tables import Array, constant, median, quantile, table, tables, valid_mean, without_nan
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.observation import RowKernels
-from rsvib_torch.restoration.scene_prior import cut_pieces, sample_rows, spread_starts, taper
-
-# Squares for power spectra, and which parts of images count
-
-_SIDE = 64  # px; side of the squares whose power spectra are computed
-
-
-def _cut_squares(images: Tensor, counts: Sequence[int]) -> Tensor:
-    """Squares (..., n, m, _SIDE, _SIDE) of images (..., H, W), n x m of which are spread evenly over the image."""
-    tops, lefts = (spread_starts(extent, _SIDE, count) for extent, count in zip(images.shape[-2:], counts, strict=True))
-    return cut_pieces(images, tops, lefts, (_SIDE, _SIDE))
-
-
-def _mostly_measured(missing: Tensor, dims: tuple[int, ...]) -> Tensor:
-    """Parts of images that count, by the share of their pixels that is missing.
-
-    A part counts up to a tenth; if all parts of an image along ``dims`` miss more, those that miss least count.
-    """
-    return (missing <= missing.amin(dims, keepdim=True).clamp(min=0.1)) & (missing < 1)
-
+from rsvib_torch.restoration.scene_prior import sample_rows
 
 # Single images: the quietest blocks of a high-pass residual
 
@@ -96,8 +74,10 @@ def noise_deviation(frames: Tensor, ignore: Tensor | None) -> Array:
         parts.append(energy.view(len(blocks), -1))
     energy = torch.cat(parts)
     if ignore is not None:
+        # blocks count up to a tenth of missing pixels; if all of an image miss more, those that miss least
         missing = blocks_of(ignore.to(frames.dtype)).mean((-2, -1))
-        energy = energy.masked_fill(~_mostly_measured(missing, (-2, -1)).view(energy.shape), math.nan)
+        counts = (missing <= missing.amin((-2, -1), keepdim=True).clamp(min=0.1)) & (missing < 1)
+        energy = energy.masked_fill(~counts.view(energy.shape), math.nan)
     powers = table(energy).reshape(*frames.shape[:-2], -1)
     powers = powers / math.prod(math.comb(2 * order, order) for order in orders)
     # Means of squares of pure noise scatter, so that their low quantile lies below the true mean, by as much as that of
@@ -203,103 +183,8 @@ def _residual_power(images: Tensor, displacement: Tensor, node_weights: Tensor) 
     sample = sample_rows(images, kernels, chosen)
     # correlation 0.9 of neighbouring rows of the scene, of weight 1e-4 beside the data
     products = torch.tensor([[1.0, 0.9**2], [-0.9, 0.0]], dtype=torch.float64, device=images.device)
-    power, rest = sample.unexplained(1e-4 * products[None, :, :, None, None].expand(-1, -1, -1, len(images), count))
+    power, rest = sample.unexplained(1e-4 * products[:, :, None, None].expand(-1, -1, len(images), count))
     return torch.as_tensor(power[0].sum(-1) / rest[0].sum(-1), dtype=images.dtype, device=images.device)
-
-
-# One frame: noise is white, the spectrum of a scene falls
-
-_SECTORS = 6  # directions, with one power law each
-
-
-def _pooled(values: Tensor) -> Tensor:
-    """Mean over 2 x 2 neighbouring frequencies of (..., U, V), without the lowest and the highest u."""
-    inner = values[..., 1 : (values.shape[-2] - 2) // 2 * 2 + 1, :]
-    return inner.unflatten(-2, (-1, 2)).unflatten(-1, (-1, 2)).mean((-3, -1))
-
-
-def noise_of_spectral_floor(frames: Tensor, ignore: Tensor | None, high_pass: Tensor) -> Tensor:
-    """Noise power (B, T) of each frame from ``noise_floor``; NaN if it is not clearly lower than ``high_pass``."""
-    floor = noise_floor(frames, ignore).mean(-1).to(high_pass.dtype)
-    # a noise level that is far too low amplifies noise more than one that is too high blurs
-    bounded = torch.maximum(floor, high_pass / 9.0)
-    # of two values that differ by less, the floor is the less accurate one
-    return torch.where(floor < high_pass / 1.25, bounded, math.nan)
-
-
-@torch.no_grad()
-def noise_floor(frames: Tensor, ignore: Tensor | None = None) -> Tensor:
-    """Power (...) of the white noise below the texture of each image (..., H, W), from its power spectrum.
-
-    At frequency f in direction d the power is ``n + c_d f^(-a_d) exp(-b f^2)``: a power law for the scene in every
-    direction, Gaussian optics, and one floor. Fisher scoring estimates all of them, for powers with exponential
-    distributions about their means (Whittle 1953). The floor is uncertain if texture exceeds it up to the highest
-    frequencies. Squares with many pixels to ``ignore`` do not count. NaN for an image of less than one square, or
-    without a usable one.
-    """
-    height, width = frames.shape[-2:]
-    images = frames.reshape(-1, height, width)
-    if min(height, width) < _SIDE:
-        return images.new_full(frames.shape[:-2], math.nan, dtype=torch.float64)
-    power = _pooled(_spectrum(images, None if ignore is None else ignore.reshape(images.shape)).mT)  # (N, U, V)
-    u = _pooled(torch.fft.rfftfreq(_SIDE, dtype=torch.float64, device=frames.device)[:, None].expand(-1, 2))
-    v = torch.fft.fftfreq(_SIDE, dtype=torch.float64, device=frames.device).unflatten(0, (-1, 2)).mean(-1)
-    frequency, direction = torch.hypot(u, v), torch.atan2(v, u)
-    used = frequency > 0.2  # cycles per px; spectra are steeper than the power law below
-    sector = ((direction[used] / math.pi + 0.5) * _SECTORS).long().clamp(0, _SECTORS - 1)
-    return _fit_floor(power[:, used], frequency[used], sector).reshape(frames.shape[:-2])
-
-
-def _spectrum(images: Tensor, ignore: Tensor | None) -> Tensor:
-    """Mean power (N, V, U) of squares of images (N, H, W); the power of white noise is its variance."""
-    counts = [min(2 * extent // _SIDE - 1, 6) for extent in images.shape[-2:]]
-    squares = _cut_squares(images, counts).flatten(1, 2)
-    window = constant(taper, _SIDE, dtype=squares.dtype, device=squares.device)
-    tapered = (squares - squares.mean((-2, -1), keepdim=True)) * window * window[:, None]
-    power = squared_modulus(torch.fft.rfft2(tapered)).to(torch.float64)
-    if ignore is None:
-        return power.mean(1)
-    missing = _cut_squares(ignore, counts).double().mean((-2, -1)).flatten(1)
-    usable = _mostly_measured(missing, (-1,))
-    return (power * usable[..., None, None]).sum(1) / usable.sum(1)[:, None, None]
-
-
-def _fit_floor(power: Tensor, frequency: Tensor, sector: Tensor) -> Tensor:
-    """Floor (N,) of powers (N, K) by Fisher scoring of ``n + c_d f^(-a_d) exp(-b f^2)`` in the logarithms of n and c.
-
-    The frequencies f (K,) are in cycles per px, ``sector`` (K,) is the direction d, and the exponents a have a weak
-    prior, 3 with a standard deviation of 8.
-    """
-    # start from half of the lowest power as floor, and from half of the mean power of each sector as scene
-    inside = torch.nn.functional.one_hot(sector, _SECTORS).to(torch.float64)  # (K, D)
-    frequency = frequency / 0.4  # in units of a typical one, so that levels and exponents are nearly independent
-    scale = power.mean(-1, keepdim=True)
-    power = (power / scale).nan_to_num(nan=1.0)
-    low = power.amin(-1, keepdim=True).clamp(min=1e-9)
-    typical = ((power @ inside) / inside.sum(0)).clamp(min=1e-9)
-    log_level, exponent = (0.5 * typical).log(), torch.full_like(typical, 2.0)
-    parameters = torch.cat([(0.5 * low).log(), torch.zeros_like(low), log_level, exponent], dim=-1)
-    expected = parameters.new_tensor([0.0] * (2 + _SECTORS) + [3.0] * _SECTORS)
-    prior = parameters.new_tensor([1e-3] * (2 + _SECTORS) + [8.0**-2] * _SECTORS)
-    log_frequency, square = frequency.log(), frequency.square()
-    for _ in range(16):
-        # expected power, and the derivatives of its logarithm
-        floor, blur, log_level, exponent = parameters.split([1, 1, _SECTORS, _SECTORS], dim=-1)
-        scene = (log_level[:, sector] - exponent[:, sector] * log_frequency - blur * square).exp()
-        model = floor.exp() + scene
-        share = scene / model
-        parts = share[..., None] * inside
-        slope = torch.cat(
-            [(floor.exp() / model)[..., None], -(share * square)[..., None], parts, -parts * log_frequency[:, None]],
-            dim=-1,
-        )
-        # step of bounded size
-        normal = slope.transpose(-2, -1) @ slope + torch.diag(prior)
-        gradient = (slope.transpose(-2, -1) @ (power / model - 1.0)[..., None])[..., 0]
-        gradient[:, 1:] += ((expected - parameters) * prior)[:, 1:]
-        parameters = parameters + torch.linalg.solve(normal, gradient).clamp(-0.7, 0.7)
-        parameters[:, 1].clamp_(min=0.0)  # optics attenuate
-    return parameters[:, 0].exp() * scale[:, 0]
 
 
 # Choice of the estimator
@@ -309,18 +194,14 @@ def _fit_floor(power: Tensor, frequency: Tensor, sector: Tensor) -> Tensor:
 def noise_levels(frames: Tensor, motion: FrameMotion, ignore: Tensor | None = None) -> Tensor:
     """Standard deviation (B, T) of the noise of each frame of B stacks, in its unit; 0 without any content.
 
-    ``estimate_noise`` counts fine texture as noise, which makes it an upper bound; two frames of a stack lower it, or
-    else the spectral floor of each. A frame without content, or with too few measured pixels, has the median noise
-    power of the others. The frames (B, T, C, H, W) are in row order, with local means at pixels to ``ignore``.
+    ``estimate_noise`` counts fine texture as noise, which makes it an upper bound; two frames of a stack lower it. A
+    frame without content, or with too few measured pixels, has the median noise power of the others. The frames (B, T,
+    C, H, W) are in row order, with local means at pixels to ``ignore``.
     """
     alone = valid_mean(np.square(noise_deviation(frames, ignore)), -1)
     alone[_constant(frames)] = math.nan
     high_pass = torch.as_tensor(alone, dtype=frames.dtype, device=frames.device)
     estimated = table(noise_of_frame_pair(frames, motion, ignore, high_pass))
-    single = np.isnan(estimated).all(1, keepdims=True)
-    if single.any():
-        estimated = np.where(single, table(noise_of_spectral_floor(frames, ignore, high_pass)), estimated)
-    # a frame that neither can estimate keeps its upper bound, NaN included
     power = np.minimum(alone, without_nan(estimated, math.inf))
     power = without_nan(np.where(np.isnan(power), median(power, 1, keepdims=True), power), 0.0)
     return torch.as_tensor(np.sqrt(power), dtype=frames.dtype, device=frames.device)

@@ -240,9 +240,12 @@ class SmoothBand:
     def at(self, u: Tensor, precision: Tensor) -> Tensor:
         """Halves (H + b, 2 b + 1, 2 n U) of the matrices in windows, complex, at frequencies u (U,) in cycles per px.
 
-        The ``precision`` are products (p + 1, p + 1, N, U) of the prior there.
+        The ``precision`` are products (p + 1, p + 1, N, U) of the prior there; those of several priors, of all scenes
+        one after the other, make as many matrices of each scene.
         """
         bands = self._product(interpolation_matrix(self.reach, u, self.left.dtype)[1])
+        priors = precision.shape[2] * self.windows // bands.shape[3]
+        bands = bands if priors == 1 else bands.repeat(1, 1, 1, priors, 1, 1)
         order, half = len(precision) - 1, len(self.left) - self.width
         # what is added to the diagonals of the first p rows of the scene, of all rows, and of the first p middle rows
         selected = constant(prior_diagonals, order, dtype=precision.dtype, device=precision.device)

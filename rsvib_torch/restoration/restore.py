@@ -25,8 +25,7 @@ from rsvib_torch.restoration.frame_motion import (
     vibration_to_undo,
     warn_of_restoration,
 )
-from rsvib_torch.restoration.judge import judge_stacks
-from rsvib_torch.restoration.restoration_verdict import RestorationVerdict
+from rsvib_torch.restoration.judge import TooLittleInCommonError, judge_stacks, verdict_on_stack
 from rsvib_torch.restoration.row_methods import restore_banded, restore_dewarp, restore_richardson_lucy
 
 # Restoration methods. A method is called as
@@ -128,6 +127,12 @@ def restore(
         mosaic=options.mosaic,
     )
     warn_of_mosaic(prepared)
+    if prepared.lost is not None:
+        rows, frames_of = int(prepared.lost.sum()), prepared.lost.any(-1).nonzero()[:, 1].unique().tolist()
+        warn_of_restoration(
+            f"{rows} rows of frames {frames_of} have one value, but detail in other frames: they count as pixels "
+            "without data"
+        )
     timing = prepared.image_timing
     _, count, _, height, _ = prepared.images.shape
     vibration, left_alone = vibration_to_undo(vibration, timing, count, height)
@@ -191,11 +196,12 @@ def _warn_if_worse(frames: PreparedFrames, restored: Tensor, motion: FrameMotion
     if frames.images.shape[1] < 2:
         return
     moving = [stack for stack, bounds in enumerate(motion.bounds) if any(bounds)]
-    verdicts = judge_stacks(frames, restored, motion, moving, joint=joint, most_pairs=2, columns=160)
-    for stack, verdict in zip(moving, verdicts, strict=True):
+    judged = judge_stacks(frames, restored, motion, moving, joint=joint, most_pairs=2, columns=160)
+    for stack, pairs in zip(moving, judged, strict=True):
         # frames that share no scene cannot be compared
-        if isinstance(verdict, RestorationVerdict) and verdict.overall in ("partly", "worse"):
+        if not isinstance(pairs, TooLittleInCommonError) and {pair.outcome for pair in pairs} & {"partly", "worse"}:
             where = f"stack {stack}: " if len(restored) > 1 else ""
+            verdict = verdict_on_stack(pairs, frames.image_timing, restored.device)
             warn_of_restoration(f"{where}{verdict.sentence}")
 
 

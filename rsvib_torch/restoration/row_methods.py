@@ -36,7 +36,7 @@ from rsvib_torch.restoration.frame_motion import FrameMotion, MovingFrames, fram
 from rsvib_torch.restoration.noise import estimate_noise
 
 _DEWARP_DEGREE = 5  # of the B-spline across rows
-_CHUNK_ROWS = 128  # interpolated at a time
+_CHUNK_ROWS = 512  # interpolated at a time; 128 take 1.2 times as long for 256 rows
 
 
 def restore_dewarp(given: MovingFrames, options: DewarpOptions = DewarpOptions()) -> Tensor:  # noqa: B008

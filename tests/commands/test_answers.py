@@ -14,6 +14,7 @@ import pytest
 import torch
 import typer
 from program import refused, rsvib
+from refusals import refuses
 from truth import Motion, recorded
 
 import rsvib_torch as rsv
@@ -239,6 +240,9 @@ def test_long_operations_report_their_progress(place, tmp_path):
         restored, found = units(lambda m=method: rsv.restore(frames, TIMING, detection, method=m, check=False))
         assert unit in found
     _, found = units(lambda: rsv.judge_restoration(frames, restored, TIMING, detection))
+    assert found == {"pairs of frames"}
+    far = rsv.Vibration(1.0, 50.0, image_motion=(9e3, 0.0))  # no pair has anything in common
+    _, found = units(lambda: refuses(lambda: rsv.judge_restoration(frames, frames, TIMING, far), "nothing in common"))
     assert found == {"pairs of frames"}
     _, found = units(lambda: rsv.write_stack(tmp_path / "r.npy", restored))
     assert found == {"frames"}

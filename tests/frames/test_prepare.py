@@ -3,6 +3,7 @@
 import itertools
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -62,6 +63,20 @@ def test_masks_follow_the_frames():
     for options in ({"saturation": "auto", "full_scale": 255}, {"saturation": 255, "full_scale": 255}):
         assert prepare_frames(deep, sensor(), **options).saturated.flatten().tolist() == [False, True, False, False]
     assert prepare_frames(deep, sensor(), saturation="auto", full_scale=300).saturated is None
+
+
+@pytest.mark.parametrize(
+    ("bits", "largest", "saturated"), [(12, 4095, True), (12, 4094, False), (10, 1023, True), (16, 65520, False)]
+)
+def test_saturation_of_fewer_bits_stored_left_aligned(bits, largest, saturated):
+    """A camera of 12 bits in files of 16 bits has at most the count 65520."""
+    counts = np.random.default_rng(0).integers(0, largest - 2, (2, 8, 8))
+    counts[:, 0, 0], counts[:, 0, 1] = largest, largest // 2
+    stored = (counts << (16 - bits)).astype(np.uint16)
+    found = prepare_frames(stored, sensor(), saturation="auto", full_scale=65535).saturated
+    assert (found is not None) == saturated
+    if saturated:
+        assert np.array_equal(found[0, :, 0].numpy(), counts == largest)
 
 
 @pytest.mark.parametrize("shape", [(4, 6), (2, 4, 6), (2, 1, 6), (2, 3, 4, 6)])

@@ -8,8 +8,9 @@ import torch
 from refusals import without_warning
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
-from rsvib_torch import SensorTiming, Vibration
-from rsvib_torch.restoration import judge_restoration, restore
+from rsvib_torch import SensorTiming, Vibration, detect_vibration
+from rsvib_torch.frames.prepare import prepare_frames
+from rsvib_torch.restoration import RestorationWarning, judge_restoration, restore
 from rsvib_torch.results.reason import Reason
 
 SCENE, MOTION, NOISE = draw_scene(272, 240, seed=12), Motion(), 0.01
@@ -35,6 +36,31 @@ def test_constant_frame_does_not_affect_the_others(method):
     assert torch.isfinite(found).all()
     for frame in (0, 2):
         assert decibel(found[frame], crop(SCENE)) > decibel(whole[frame], crop(SCENE)) - 0.4
+
+
+def test_rows_that_were_lost_count_as_missing():
+    """60 black rows in one of four frames: the motion is measured, and all that was recorded is restored."""
+    scene, motion = draw_scene(400, 240, seed=31), Motion((1.6, 1.3), (71.0, 47.0), (0.4, 1.3))
+    timing = SensorTiming(row_time=5e-5, exposure_rows=20, frame_rows=390)
+    frames = torch.from_numpy(take_frames(scene, timing, motion, 4, 0.004)).float()
+    frames[2, 100:160] = 0.0
+    detection = detect_vibration(frames, timing)
+    assert detection.reliable.all()
+    with pytest.warns(RestorationWarning, match=r"60 rows of frames \[2\]"):
+        restored = restore(frames, timing, detection)
+    recorded = np.r_[0:90, 170 : frames.shape[1]]
+    for frame, rows in ((0, slice(None)), (1, slice(None)), (2, recorded), (3, slice(None))):
+        before, after = (decibel(images[frame][rows], crop(scene)[rows]) for images in (frames, restored))
+        assert after > before + 15
+
+
+def test_rows_without_detail_in_all_frames_are_measured():
+    """Letterbox bars, a black sky with a hot pixel, and a frame that is dark as a whole: no row was lost."""
+    frames = noisy_frames()
+    frames[:, :30] = 0.0
+    frames[0, 10, 50] = 0.1
+    frames[1] = 0.0
+    assert prepare_frames(frames, camera()).missing is None
 
 
 def test_frame_without_data_does_not_affect_joint_restoration():

@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scipy import ndimage
 from truth import Motion, draw_scene, recorded, take_frames
 
 from rsvib_torch import SensorTiming
 from rsvib_torch.restoration.frame_motion import frame_motion
-from rsvib_torch.restoration.noise import estimate_noise, noise_floor, noise_levels
+from rsvib_torch.restoration.noise import estimate_noise, noise_levels
 
 TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
 
@@ -38,8 +37,6 @@ def test_two_frames_separate_texture_from_noise(image_motion):
     found = levels(frames + noise, motion)
     assert found[0].item() == pytest.approx(0.004, rel=0.3)
     assert found[1].item() == pytest.approx(0.008, rel=0.15)
-    single = frames[:1] + noise[:1]
-    assert 0.33 * alone[0].item() <= levels(single, motion)[0].item() < 0.75 * alone[0].item()
 
 
 @pytest.mark.parametrize("shape", [(128, 96), (512, 512)])
@@ -105,37 +102,3 @@ def test_frames_without_content_have_no_noise(count, case):
     assert found.shape == (1, count)
     assert (found >= 0).all() if case == "tiny" else (found == 0).all()
     assert torch.equal(frames, before)
-
-
-def fractal(steepness, optics, size=320, seed=5):
-    """Texture whose amplitude is a power of the frequency, blurred by Gaussian optics."""
-    frequency = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size))
-    frequency[0, 0] = np.inf
-    noise = np.random.default_rng(seed).standard_normal((size, size))
-    texture = np.fft.irfft2(np.fft.rfft2(noise) / frequency**steepness, (size, size))
-    return 0.5 + 0.15 * ndimage.gaussian_filter(texture / texture.std(), optics, mode="wrap")
-
-
-def floor_of(image):
-    return noise_floor(image).sqrt().item()
-
-
-@pytest.mark.parametrize(("shape", "level"), [((64, 64), 0.02), ((200, 90), 1e-4), ((700, 500), 0.02)])
-def test_floor_of_white_noise(shape, level):
-    noise = level * torch.randn(shape, generator=torch.Generator().manual_seed(2))
-    assert floor_of(0.3 + noise) == pytest.approx(level, rel=0.1 if min(shape) > 64 else 0.3)
-
-
-@pytest.mark.parametrize(
-    ("steepness", "level", "texture_adds"), [(1.0, 0.02, 1.2), (1.5, 0.005, 1.09), (1.5, 0.002, 1.4)]
-)
-def test_floor_is_below_texture(steepness, level, texture_adds):
-    scene = fractal(steepness, 0.5)
-    image = torch.from_numpy(scene + level * np.random.default_rng(0).standard_normal(scene.shape)).float()
-    assert estimate_noise(image).item() > texture_adds * level
-    assert 0.6 * level < floor_of(image) < 0.5 * (level + estimate_noise(image).item())
-
-
-def test_floor_of_small_and_empty_images():
-    assert noise_floor(torch.rand(2, 63, 200)).isnan().all()
-    assert noise_floor(torch.zeros(64, 64)) == 0
