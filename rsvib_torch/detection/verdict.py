@@ -11,7 +11,7 @@ import numpy as np
 
 from rsvib_torch.detection.measurements import OtherMotion
 from rsvib_torch.detection.tones.fit import MIN_GAIN, offset_gain
-from rsvib_torch.detection.tones.selection import MIN_OFFSET, MIN_SIGNIFICANCE
+from rsvib_torch.detection.tones.selection import MIN_OFFSET
 from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
@@ -124,7 +124,7 @@ def _reasons_against_stack(stack: Table, timing: RowTiming, max_tones: float, le
         if len(tones) >= max_tones:
             reasons.append(Reason("too_many_tones", name, len(tones), max_tones))
         for tone in tones:
-            reasons += _tone_reasons(name, numbers, tone, len(tones), timing, least_gain)
+            reasons += _tone_reasons(name, numbers, tone, timing, least_gain)
         reasons += _displacement_reasons(name, numbers, len(tones))
         if by_rows:
             reasons += rotation_reasons(axis, axes, stack["differential"], numbers["size"])
@@ -164,20 +164,16 @@ def with_reasons_of_all(of_all: list[Reason], findings: Findings) -> Findings:
 _MIN_GAIN_OF_TWO = 0.3
 
 
-def _tone_reasons(
-    axis: str, numbers: Table, tone: int, num_tones: int, timing: RowTiming, least_gain: float
-) -> list[Reason]:
+def _tone_reasons(axis: str, numbers: Table, tone: int, timing: RowTiming, least_gain: float) -> list[Reason]:
     """Reasons against one tone."""
     names = ("amplitude", "amplitude_std", "frequency", "frequency_std", "gain")
     size, size_std, hertz, hertz_std, gain = (numbers[name][tone] for name in names)
     turns = math.pi * hertz * timing.exposure_time
     offset = size * gain * abs(math.sin(turns) / turns if turns else 1.0)
     details: dict[str, float | str] = {"frequency": hertz}
-    reasons, needed = [], MIN_SIGNIFICANCE * size_std
+    reasons = []
     if not (0 < size_std < math.inf and 0 < hertz_std < math.inf):
         reasons.append(Reason("tone_uncertainty_unknown", axis, details=details))
-    elif num_tones == 1 and size < needed:
-        reasons.append(Reason("tone_not_significant", axis, size, needed, details | {"std": size_std}))
     elif offset < MIN_OFFSET:
         reasons.append(Reason("tone_too_small", axis, offset, MIN_OFFSET, details))
     if gain < least_gain:
