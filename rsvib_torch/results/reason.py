@@ -202,8 +202,8 @@ _TONES = {
     "tones_alias": ReasonKind(
         "tones of {value:.5g} and {limit:.5g} Hz are a multiple of the frame rate apart: both explain one motion, "
         "because the rows are read in another time than stated, or the camera vibrates in roll",
-        "check row_time and the readout direction",
-        "frequencies of two tones of a video, whose difference is a multiple of the frame rate",
+        f"use frames at another rate if both exist, {_CHECK_TIMING}",
+        "frequencies of two tones, whose difference is a multiple of the frame rate (three standard deviations)",
         "Hz",
     ),
     "tone_changes": _px(

@@ -47,6 +47,16 @@ def causes(found):
     return first
 
 
+@pytest.mark.parametrize(("factor", "refused"), [(1.0, False), (0.95, True)])
+def test_tones_a_frame_rate_apart_are_one_with_a_wrong_timing(factor, refused):
+    # The motion along x is slow and agrees with any timing; y has a second tone then, 133 Hz beside the first.
+    timing = SensorTiming(row_time=2.616e-5, exposure_rows=1.2, frame_rows=301.6)
+    taken = recorded((240, 200), timing, Motion((0.41, 0.3), (10.0, 62.0), (1.0, 0.4)), 8, 0.005, seed=1)
+    found = detect_vibration(taken, replace(timing, frame_rows=factor * timing.frame_rows))
+    assert found.reliable.tolist() == [not refused] * 2, found.reasons
+    assert [["tones_alias"] * refused] * 2 == [[one.code for one in of_axis] for of_axis in found.findings]
+
+
 def test_correct_timing_is_not_doubted(frames):
     found = detect_vibration(frames, TIMING)
     assert found.reliable.all(), found.reasons
