@@ -159,25 +159,26 @@ def with_reasons_of_all(of_all: list[Reason], findings: Findings) -> Findings:
     )
 
 
-# Frame rates; largest three standard deviations of a difference of frequencies that is compared with multiples of it
-_MAX_ALIAS_ERROR = 0.15
+# Frame rates, three standard deviations of a difference of frequencies that is compared with multiples of it. A wrong
+# timing leaves a residual, which gave 0.02 and more; harmonics and the sidebands of a lamp may be known better
+_LEAST_ALIAS_ERROR, _MOST_ALIAS_ERROR = 0.01, 0.15
 
 
 def _alias_reasons(stack: Table, timing: RowTiming) -> list[Reason]:
-    """Reasons against all axes from tones of an axis that are a multiple of the frame rate apart.
+    """Reason against all axes from the first two tones of an axis that are a multiple of the frame rate apart.
 
     With a wrong timing, two of them explain one tone, and the axes have one timing. Of 13 axes with several tones in
     three frames or more that were reliable and wrong (frame_rows, row_time or the size of frames wrong, interlaced
     rows, exposures that alternate), 10 had such tones; of 45 right ones, 1.
     """
-    against = []
     for name, *tones in zip(AXIS_NAMES, stack["amplitude"], stack["frequency"], stack["frequency_std"], strict=False):
         for (size, hertz, std), (other_size, other_hertz, other_std) in combinations(zip(*tones, strict=True), 2):
             cycles = abs(hertz - other_hertz) * timing.frame_period
             error = 3 * math.hypot(std, other_std) * timing.frame_period
-            if min(size, other_size) > 0 and round(cycles) and abs(cycles - round(cycles)) < error < _MAX_ALIAS_ERROR:
-                against.append(Reason("tones_alias", name, hertz, other_hertz))
-    return against
+            apart = max(abs(cycles - round(cycles)), _LEAST_ALIAS_ERROR)
+            if min(size, other_size) > 0 and round(cycles) and apart < error < _MOST_ALIAS_ERROR:
+                return [Reason("tones_alias", name, hertz, other_hertz)]
+    return []
 
 
 # Offset gain of a tone in two frames. A tone with a smaller one and an image motion may explain the rows as well as a
@@ -195,8 +196,8 @@ def _tone_reasons(axis: str, numbers: Table, tone: int, timing: RowTiming, least
     offset = size * gain * abs(math.sin(turns) / turns if turns else 1.0)
     details: dict[str, float | str] = {"frequency": hertz}
     reasons = []
-    # Of slow tones with right timing, the displacement was wrong by at most 2.4 standard deviations if the amplitude had
-    # one of 0.25 to 10 amplitudes (50 axes), and by more than 5 for 2 of 5 with larger ones
+    # Displacements by slow tones were wrong by at most 2.4 standard deviations if the amplitude had one of 0.25 to 10
+    # amplitudes (50 axes with right timing), and by more than 5 for 2 of 5 with larger ones
     if not (0 < size_std < 10 * size and 0 < hertz_std < math.inf):
         reasons.append(Reason("tone_uncertainty_unknown", axis, details=details))
     elif offset < MIN_OFFSET:
