@@ -115,8 +115,7 @@ def _reasons_against_stack(stack: Table, timing: RowTiming, max_tones: float, le
         of_all = [Reason("rows_not_registered", None, stack["measured"], _MIN_MEASURED, {"what": what})]
     if by_rows:
         of_all += exposure_reasons(timing, *stack["blur"])
-    of_all += _alias_reasons(stack, timing)
-    against = []
+    against, aliases = [], list[Reason]()
     for axis, name in enumerate(AXIS_NAMES[:axes]):
         numbers = {quantity: values[axis] for quantity, values in stack.items() if quantity not in _OF_STACK}
         tones = [tone for tone, amplitude in enumerate(numbers["amplitude"]) if amplitude > 0]
@@ -133,8 +132,10 @@ def _reasons_against_stack(stack: Table, timing: RowTiming, max_tones: float, le
             reasons += residual_reasons(name, numbers)
         else:
             reasons += _band_reasons(name, numbers)
+        if not reasons:
+            aliases += _alias_reasons(name, numbers, timing)
         against.append(reasons)
-    return against
+    return [[*aliases, *reasons] for reasons in against]
 
 
 def scene_reasons(curve: OffsetCurve, columns: int) -> list[list[Reason]]:
@@ -164,20 +165,20 @@ def with_reasons_of_all(of_all: list[Reason], findings: Findings) -> Findings:
 _LEAST_ALIAS_ERROR, _MOST_ALIAS_ERROR = 0.01, 0.15
 
 
-def _alias_reasons(stack: Table, timing: RowTiming) -> list[Reason]:
-    """Reason against all axes from the first two tones of an axis that are a multiple of the frame rate apart.
+def _alias_reasons(axis: str, numbers: Table, timing: RowTiming) -> list[Reason]:
+    """Reason against all axes from tones of an axis, reliable otherwise, that are a multiple of the frame rate apart.
 
     With a wrong timing, two of them explain one tone, and the axes have one timing. Of 13 axes with several tones in
     three frames or more that were reliable and wrong (frame_rows, row_time or the size of frames wrong, interlaced
     rows, exposures that alternate), 10 had such tones; of 45 right ones, 1.
     """
-    for name, *tones in zip(AXIS_NAMES, stack["amplitude"], stack["frequency"], stack["frequency_std"], strict=False):
-        for (size, hertz, std), (other_size, other_hertz, other_std) in combinations(zip(*tones, strict=True), 2):
-            cycles = abs(hertz - other_hertz) * timing.frame_period
-            error = 3 * math.hypot(std, other_std) * timing.frame_period
-            apart = max(abs(cycles - round(cycles)), _LEAST_ALIAS_ERROR)
-            if min(size, other_size) > 0 and round(cycles) and apart < error < _MOST_ALIAS_ERROR:
-                return [Reason("tones_alias", name, hertz, other_hertz)]
+    tones = zip(*(numbers[name] for name in ("amplitude", "frequency", "frequency_std")), strict=True)
+    for (size, hertz, std), (other_size, other_hertz, other_std) in combinations(tones, 2):
+        cycles = abs(hertz - other_hertz) * timing.frame_period
+        error = 3 * math.hypot(std, other_std) * timing.frame_period
+        apart = max(abs(cycles - round(cycles)), _LEAST_ALIAS_ERROR)
+        if min(size, other_size) > 0 and round(cycles) and apart < error < _MOST_ALIAS_ERROR:
+            return [Reason("tones_alias", axis, hertz, other_hertz)]
     return []
 
 
