@@ -233,7 +233,7 @@ def _between(stated: SensorTiming, agreeing: SensorTiming) -> Reason:
 
 _MOST_TRIED = 5  # timings of a stack
 # standard deviations, relative change of the frame period with which tones explain the rows better, from which on it is
-# tried: of 42 stacks with right timing, 2.6 standard deviations at most; smaller changes do not matter
+# tried: of 121 stacks with right timing, 2.7 standard deviations at most, rms 0.9; smaller changes do not matter
 _SIGNIFICANT, _SMALLEST = 3.5, 0.005
 
 
@@ -254,7 +254,7 @@ def other_period(measurements: Measurements, fit: ToneFit, timing: RowTiming, nu
         chi_square += float(np.square(problem.residual).sum())
     change = total / max(precision, 1e-300)
     left = max(1 - total * change / max(chi_square, 1e-300), 0.0)  # of the square of the residual
-    std = math.sqrt(left / max(precision * float(np.min(measurements.independent)), 1e-300))
+    std = math.sqrt(left / max(precision, 1e-300))
     return 1 + change if max(_SIGNIFICANT * std, _SMALLEST) < abs(change) < 0.5 else None
 
 
