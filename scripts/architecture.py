@@ -46,6 +46,7 @@ INNER_LAYERS: dict[str, tuple[set[str], ...]] = {
         {"result", "convergence"},
         {"refinement"},
         {"pipeline"},
+        {"other_timing"},
         {"attempts"},
         {"shapes"},
         {"detect"},

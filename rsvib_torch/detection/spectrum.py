@@ -214,7 +214,12 @@ def _spectrum(measured: Measurements, frequency: Array, known: Array) -> tuple[A
     places, sizes = (frequency - lines[:, :1].real) * span, lines[:, 1:]
     complex_amplitude = complex_amplitude + (sizes * np.exp(-0.5 * np.pi * np.square(places))).sum(0)
     noise = 2 * np.sqrt(level / energy) / np.maximum(np.abs(attenuation), 1e-12)
-    return np.abs(complex_amplitude), noise, lines, response
+    # Errors of the registration are lines of any size in a blind band: these must also be shown by the offsets.
+    gain = np.interp(lines[:, 0].real, frequency, response / response.max())
+    offset = np.abs(lines[:, 1]) * gain
+    listed = (gain >= _BLIND_GAIN) | (offset >= SMALLEST_SHOWN * offset.max(initial=0.0))
+    listed[: len(known)] = True
+    return np.abs(complex_amplitude), noise, lines[listed], response
 
 
 def _fitted(measured: Measurements, frequencies: Array) -> tuple[ToneFit, Array]:

@@ -185,12 +185,6 @@ _TONES = {
     "tone_uncertainty_unknown": ReasonKind(
         "the uncertainty of the tone of {frequency:.4g} Hz is unknown: too few rows were measured", _MORE_FRAMES
     ),
-    "tone_not_significant": _px(
-        "tone of {frequency:.4g} Hz is not significant: its amplitude is {value:.3g} ± {std:.2g} px, and 4 standard "
-        "deviations, {limit:.3g} px, are needed",
-        _MAY_BE_STILL,
-        "amplitude of the only tone, below 4 standard deviations",
-    ),
     "tone_too_small": _px(
         "tone of {frequency:.4g} Hz is too small: its offsets of {value:.2g} px are below {limit:g} px, where errors "
         "of interpolation may cause them",
@@ -208,8 +202,8 @@ _TONES = {
     "tones_alias": ReasonKind(
         "tones of {value:.5g} and {limit:.5g} Hz are a multiple of the frame rate apart: both explain one motion, "
         "because the rows are read in another time than stated, or the camera vibrates in roll",
-        "check row_time and the readout direction",
-        "frequencies of two tones of a video, whose difference is a multiple of the frame rate",
+        f"use frames at another rate if both exist, {_CHECK_TIMING}",
+        "frequencies of two tones, whose difference is a multiple of the frame rate (three standard deviations)",
         "Hz",
     ),
     "tone_changes": _px(
@@ -232,7 +226,7 @@ _TONES = {
     ),
     "displacement_uncertain": _px(
         f"{_UNCERTAIN}; the standard deviation must be at most 25 % of the displacement, {{limit:.2g}} px",
-        _MORE_FRAMES,
+        _MAY_BE_STILL,
         "standard deviation of the displacement of the rows, above 25 % of it",
     ),
     "rows_unexplained": _px(

@@ -47,6 +47,25 @@ def causes(found):
     return first
 
 
+@pytest.mark.parametrize(
+    ("factor", "tone", "codes"),
+    [
+        (1.0, (0.3, 62.0), []),
+        (1.0, (0.2, 190.0), []),
+        (0.99, (0.2, 190.0), ["other_frame_rows"]),  # the tone leaves less than is permitted
+        (0.95, (0.3, 62.0), ["other_frame_rows", "tones_alias"]),  # explained by two, one frame rate apart
+    ],
+)
+def test_a_frame_period_that_tones_contradict_is_refused_along_all_axes(factor, tone, codes):
+    # The motion along x is slow and agrees with any frame period.
+    timing = SensorTiming(row_time=2.616e-5, exposure_rows=1.2, frame_rows=301.6)
+    moved = Motion((0.41, tone[0]), (10.0, tone[1]), (1.0, 0.4))
+    taken = recorded((240, 200), timing, moved, 8, 0.005, seed=1)
+    found = detect_vibration(taken, replace(timing, frame_rows=factor * timing.frame_rows))
+    assert [[one.code for one in of_axis] for of_axis in found.findings] == [codes] * 2
+    assert all(one.limit == pytest.approx(301.6, rel=0.01) for one in causes(found))
+
+
 def test_correct_timing_is_not_doubted(frames):
     found = detect_vibration(frames, TIMING)
     assert found.reliable.all(), found.reasons

@@ -74,6 +74,12 @@ def test_a_line_in_a_blind_band_has_no_ghosts_outside():
     assert float((spectrum.amplitude[0] / spectrum.noise[0])[elsewhere].nan_to_num().max()) < 4
 
 
+def test_errors_of_the_registration_are_no_lines_where_the_exposure_averages():
+    errors = (0.09, 1015.0, 1.0)  # of the offsets, 0.0013 px: a tone of 0.09 px would cause them
+    lines = detection_with_offsets((*TONES[:1], errors), 1e-4).spectrum().lines
+    assert lines.frequency[0].tolist() == pytest.approx([137.0], abs=0.1)
+
+
 def test_noise_alone_has_no_lines_and_the_stated_noise():
     spectrum = detection_with_offsets(((0.0, 50.0, 0.0),), 0.01).spectrum()
     assert not spectrum.lines.amplitude.any()
