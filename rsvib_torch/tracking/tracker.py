@@ -68,6 +68,9 @@ from rsvib_torch.tracking.tracked_frame import TrackedFrame, TrackedTones, Track
 _MAX_PREDICTED_STD = 0.5  # px; the gradients of rows reach a few tenths of a pixel, and there are several rounds
 _MAX_UNMEASURED_STD = 0.1  # px; paths of hand-held cameras are predicted within 0.25 px, with 1 px within 0.6 px
 _MAX_UNEXPLAINED = 1.0  # px, residual displacement of rows; they are not measured correctly over larger distances
+# px, by which a frame moves further than predicted, beyond which its rows are measured around that place: by up to 8 px
+# where a heel strikes. Frames whose rows vibrate by 1 px seem to move by up to 1.2 px, with which rows became worse
+_MAX_MISSED = 2.0
 # of the rms displacement by the tones, residual beyond which they are not removed. Where a vibration of 2 px stops, the
 # first frame at rest had 0.12 to 0.2, and would become worse by 19 dB
 _MAX_LEFT = 0.1
@@ -351,8 +354,8 @@ class VibrationTracker:
             return state.without_track("the rows are far from where the motion places them")
         # 2. How far the frame has moved from the one before.
         middle = 0.5 * (track.start + frame.time) + self._rows.time_to_middle(height) - centre
-        moved = state.live.moved + step_of_rows(measurements, measurements.displacements - by_tones, middle)
-        state = replace(state, live=replace(state.live, moved=moved))
+        step = step_of_rows(measurements, measurements.displacements - by_tones, middle)
+        state = replace(state, live=replace(state.live, moved=state.live.moved + step))
         # 3. The verdict on the tones.
         aliasing, interval = table(scene.gradients.aliasing), np.array([frame.time - track.start])
         fit = with_unknown_amplitudes(fit, aliasing, other.unexplained, interval, self._rows.exposure_time, known=0)
@@ -388,7 +391,7 @@ class VibrationTracker:
         rows = self._rows.row_starts(1, images.shape[-2])[0, ::8]
         first, last = (motion.mean_displacement(rows + start, self._rows.exposure_time) for start in starts.tolist())
         missed = step - table(last - first).reshape(-1, 2).mean(0)
-        return missed if np.abs(missed).max() > _MAX_UNEXPLAINED else None
+        return missed if np.abs(missed).max() > _MAX_MISSED else None
 
     def _judged(
         self, frame: _GreyFrame, fit: ToneFit, growth: Array, measurements: Measurements, other_motion: OtherMotion
@@ -547,15 +550,11 @@ class VibrationTracker:
             # are moved by the path as well, unless something moves across a part of them.
             trusted = tensor(np.any(track.trusted, 0)).to(device)
             followed = trusted | bool(self.options.steady and tones.apart < _MAX_APART)
-            # The place of the restored frame: that of the last measured one, the path from there, and tones that stay.
-            kept = replace(
-                motion,
-                amplitude=motion.amplitude * ~trusted[:, None],
-                image_motion=torch.zeros_like(motion.image_motion),
-                image_acceleration=torch.zeros_like(motion.image_motion),
-            )
-            exposure = self._rows.exposure_time
-            stays = table(kept.mean_displacement(torch.tensor([-0.5 * exposure]), exposure))[0]
+            # The place of the restored frame: that of the last measured one, the path from there, and the mean over the
+            # rows of tones that stay.
+            stay = replace(motion.scaled(0.0), amplitude=motion.amplitude * ~trusted[:, None])
+            rows = self._rows.row_starts(1, prepared.images.shape[-2])[0, ::8] - half
+            stays = table(stay.mean_displacement(rows.to(device), self._rows.exposure_time)).mean(0)
             since, until = (track.filter.path(start + half - track.filter.time) for start in (track.start, state.time))
             path = offsets_from_row_order(tensor(state.live.moved + stays + until - since).to(device), self.timing)
             motion = replace(motion.scaled(followed), amplitude=motion.amplitude * trusted[:, None])
