@@ -244,7 +244,8 @@ class VibrationTracker:
         state = replace(self._state, time=time, lost="")
         if latest.shows_nothing_new(before):
             self._state = state
-            return self._result(prepared, state, usable=False)
+            tracked = self._result(prepared, state, usable=False)
+            return replace(tracked, motion=replace(tracked.motion, image_shift=state.live.shift))
         longest = MAX_SPAN * self._rows.row_time  # s; frames further apart do not resolve frequencies
         recent = tuple(frame for frame in state.frames if time - frame.time <= longest)
         state = replace(state, frames=(*recent, latest)[-self.options.window :], untried=state.untried + 1)
