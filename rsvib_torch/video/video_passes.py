@@ -1,22 +1,19 @@
 """Passes through a video: the motion of all frames, where they are moved to, verdict and record of the parts."""
 
 import math
-from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 
-import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from rsvib_torch.detection.sensitivity import timing_sensitivity, with_row_time_std
 from rsvib_torch.detection.tones.fit import ToneFit
 from rsvib_torch.detection.verdict import exposure_reasons
 from rsvib_torch.execution.parallel import ONE_BLAS_THREAD, prefetched
-from rsvib_torch.gyroscope.corner_tracks import followed_pair, tracks_of_pairs
+from rsvib_torch.gyroscope.corner_tracks import tracks_of_pairs
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
 from rsvib_torch.gyroscope.rotation_alignment import AlignOptions, RotationAlignment, align_rates
 from rsvib_torch.imaging.trajectory import places_at_rest, recorded_offsets
@@ -27,22 +24,21 @@ from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import ProcessVideoOptions
-from rsvib_torch.registration.corners import CornerFollower, Corners, reduction, repetition
+from rsvib_torch.registration.corners import Corners, reduction
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
 from rsvib_torch.stacks.job import stored_frame
-from rsvib_torch.stacks.recorded_motion import compared_pairs
 from rsvib_torch.stacks.windows import WindowRecord
 from rsvib_torch.text import number_of
-from rsvib_torch.tracking.camera_path import WINDOW_FRAMES, CameraPath, camera_path, shake
-from rsvib_torch.tracking.window_fit import SIGNIFICANT, Tone, WindowPath, WindowTone
+from rsvib_torch.tracking.camera_path import CameraPath, camera_path, shake
+from rsvib_torch.tracking.window_fit import SIGNIFICANT, WindowPath
+from rsvib_torch.tracking.window_tones import Tone, WindowTone
 from rsvib_torch.video import Margins
+from rsvib_torch.video.first_pass import CHECKED_FRAMES, PART_FRAMES, FirstPass
 from rsvib_torch.video.recorded_rotation import RecordedRotation
 from rsvib_torch.video.steadying import steady_shifts
 from rsvib_torch.video.video_frames import Frame, FrameTrack, VideoFrames
 
-PART_FRAMES = 32  # of a part of the video, which is encoded by itself; an interrupted run repeats at most one part
-_CHECKED_FRAMES = 8  # of each part, in which the shaking is measured
 _AHEAD = 4  # frames decoded before they are used
 _GAIN_ERROR = 0.02  # of an amplitude: the mean over the patch of a corner is known so well (52 to 205 Hz: 0.4 to 1.6 %)
 # px^-2, of the third cumulant of the path within an exposure, by which a blurred corner is found beside the mean of the
@@ -53,12 +49,6 @@ _SAME_ALIAS = 0.01  # periods per frame; tones are separated from 0.02 on in a w
 # stated as 93.47 and 121.15 Hz and jumped by 0.37 and 0.22 rad
 _MAX_JUMP = 0.1
 _MAX_APART = 0.25  # of a tone, left in a third of the rows or columns: up to 0.14 of tones of cameras, at night
-# Of the usual change from frame to frame: at least 0.18 in 36 clips that a hand holds, and at most 0.12 of copies in a
-# video of 24 frames per second that is stored as 30. More frames in a row are no copies: a pan has ended, or it is dark
-_COPY, _MEMORY, _MOST_IN_A_ROW = 0.15, 8, 3
-# Of the contrast of two frames of 16 x 16 px, their mean difference: at least 0.9 at 14 cuts, at most 0.7 in 13 clips.
-# Light that flickers more leaves many corners; those of unrelated frames that agree by chance are few
-_CUT, _THUMBNAIL, _FEW = 0.8, (16, 16), 64
 _MAX_COPIES = 0.05  # of the frames; with more, frames were taken at other times than stored: 143 Hz became 149 Hz
 # Of the distance at which a scene repeats itself, a step from frame to frame, along it, up to which the part of the
 # video shows by how much the frames move; a larger one may be another by the whole distance
@@ -113,7 +103,7 @@ class VideoPasses:
         timing = self.frames.job.timing
         half = timing.time_to_middle(self.frames.size[int(timing.scan_axis)])
         times = np.array(self.starts) + half
-        found = _FirstPass(self, times)
+        found = FirstPass(self, times)
         if self.rates is None:
             with ONE_BLAS_THREAD:
                 path = camera_path(found.pairs(progress), timing, self.frames.size, has_tones=not self.stabilised)
@@ -218,7 +208,7 @@ class VideoPasses:
         Before and after are of the same corners: in other frames, others are found, some of them on cars that pass.
         """
         measured: dict[int, Array] = {}  # (2, 3) px, before and after: x, y and rows, of a frame and the next one
-        for pair in pairwise(tracks[:_CHECKED_FRAMES]):
+        for pair in pairwise(tracks[:CHECKED_FRAMES]):
             raw = motion.corners.get(pair[0].index)
             if raw is not None:
                 both = shake(raw), shake(self._restored_corners(motion, pair, raw))
@@ -417,87 +407,6 @@ class VideoPasses:
         return tuple(findings)
 
 
-class _FirstPass:
-    """Follows corners from each usable frame of a video to the next one; copies of the frame before do not count."""
-
-    def __init__(self, video: VideoPasses, times: Array) -> None:
-        """A pass through a video, the middles of whose frames are at ``times`` (N,) in s."""
-        self._video, self._timing, self._times = video, video.frames.job.timing, times
-        self.taken = times.copy()  # of copies, when the frame before was taken
-        self.faults: dict[int, str] = {}  # number of each frame that cannot be used, with the reason
-        self.corners: dict[int, Corners] = {}  # between a frame and the next one, of the first frames of each part
-        self.compared: dict[int, Corners] = {}  # with a gyroscope, likewise, of some frames of the video
-        self.repetitions: dict[int, Array | None] = {}  # without a gyroscope, of each part
-        self._chosen = compared_pairs(len(times)) if video.rates is not None else []
-        self._others: set[int] = set()  # frames that show something else than the frame before
-        self._before: tuple[int, NDArray[np.uint8]] | None = None  # the usable frame before, and its number
-        self._changes: deque[float] = deque(maxlen=_MEMORY)  # counts, of the frames before
-        self._waiting: list[tuple[int, NDArray[np.uint8], float]] = []  # possible copies of it, and their changes
-        self._follower = CornerFollower(self._timing, compare_blur=video.rates is None and not video.stabilised)
-
-    @property
-    def cuts(self) -> list[int]:
-        """Numbers of the first frames of further shots; two other frames in a row are a flash."""
-        return [index for index in sorted(self._others) if not self._others & {index - 1, index + 1}]
-
-    def pairs(self, progress: Callable[[], None]) -> Iterator[Corners | None]:
-        """Corners between each usable frame and the one before; a thread follows them, up to a window ahead."""
-        with closing(prefetched(self._followed(), WINDOW_FRAMES)) as frames:
-            for corners in frames:
-                progress()
-                yield from corners
-
-    def _followed(self) -> Generator[tuple[Corners | None, ...], None, None]:
-        with closing(self._video.decoded()) as frames:
-            for index, frame in enumerate(frames):
-                yield self._next(index, frame)
-
-    def _next(self, index: int, frame: Frame | str) -> tuple[Corners | None, ...]:
-        """The corners between usable frames that are known with a frame."""
-        if isinstance(frame, str):
-            self.faults[index] = frame
-            return ()
-        grey, before = self._video.frames.grey(frame), self._before
-        changed = math.inf if before is None else cv2.norm(grey, before[1], cv2.NORM_L1) / grey.size
-        usual = float(np.median(self._changes)) if len(self._changes) >= _MEMORY // 2 else 0.0
-        if before is None or changed > _COPY * usual:
-            self._waiting.clear()
-            return self._used(index, grey, changed)
-        self.taken[index] = self.taken[before[0]]
-        self._waiting.append((index, grey, changed))
-        if len(self._waiting) <= _MOST_IN_A_ROW:
-            return ()
-        waiting, self._waiting = self._waiting, []
-        return tuple(corners for one in waiting for corners in self._used(*one))
-
-    def _used(self, index: int, grey: NDArray[np.uint8], changed: float) -> tuple[Corners | None, ...]:
-        """The corners between a frame that is no copy and the usable frame before, if there is one."""
-        self.taken[index], before = self._times[index], self._before
-        if grey.min() == grey.max():
-            self.faults[index] = f"frame {index} is constant"
-            return ()
-        if self._video.rates is None and index // PART_FRAMES not in self.repetitions:
-            self.repetitions[index // PART_FRAMES] = repetition(grey)
-        corners = self._follower.next(grey, self._video.starts[index])
-        self._before = index, grey
-        if before is None:
-            return ()
-        self._changes.append(changed)
-        if (corners is None or len(corners.rows) < _FEW) and _shows_other(grey, before[1]):
-            corners = None
-            self._others.add(index)
-        if before[0] == index - 1:
-            if corners is not None and index % PART_FRAMES < _CHECKED_FRAMES:
-                self.corners[index - 1] = corners
-            if index - 1 in self._chosen:
-                starts = self._video.starts[index - 1 : index + 1]
-                self.compared[index - 1] = followed_pair(before[1], grey, starts, self._timing)
-        if corners is not None and self._video.stabilised:
-            both = np.broadcast_to(self.taken[[before[0], index]], corners.times.shape)
-            corners = replace(corners, times=both)
-        return (corners,)
-
-
 def shakes_more(before: float, after: float) -> bool:
     """Whether frames shake visibly more, by rms motions in px, than before."""
     return after > _MORE_SHAKING * before + _VISIBLE_SHAKING
@@ -518,12 +427,3 @@ def tone_tables(tones: list[Tone], axes: int) -> Array:
             size = abs(tone.coefficient), tone.frequency, phase, tone.amplitude_std, tone.frequency_std
             values[:, axis, number] = size
     return values
-
-
-def _shows_other(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> bool:
-    """Whether two frames (H, W) show different scenes, not one scene that moves by a part of the frame."""
-    small = [
-        cv2.resize(frame, _THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.float64) for frame in (first, second)
-    ]
-    contrast = min(float(frame.std()) for frame in small)
-    return float(np.abs(small[0] - small[1]).mean()) > _CUT * contrast
