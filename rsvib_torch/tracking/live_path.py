@@ -22,7 +22,7 @@ _LEAST_PEAK = 0.1  # of a phase correlation; that of frames without a scene in c
 
 
 def _nowhere() -> Tensor:
-    return torch.zeros(2, dtype=torch.float64)
+    return torch.zeros(2, dtype=torch.float64, device="cpu")
 
 
 @dataclass(frozen=True, eq=False)

@@ -245,7 +245,7 @@ class VibrationTracker:
         if latest.shows_nothing_new(before):
             self._state = state
             tracked = self._result(prepared, state, usable=False)
-            return replace(tracked, motion=replace(tracked.motion, image_shift=state.live.shift))
+            return replace(tracked, motion=replace(tracked.motion, image_shift=state.live.shift.to(tracked.path)))
         longest = MAX_SPAN * self._rows.row_time  # s; frames further apart do not resolve frequencies
         recent = tuple(frame for frame in state.frames if time - frame.time <= longest)
         state = replace(state, frames=(*recent, latest)[-self.options.window :], untried=state.untried + 1)
@@ -267,7 +267,7 @@ class VibrationTracker:
         if self.options.steady:
             place, step = None if tracked.tones is None else tracked.path, time - self._state.time
             state = replace(state, live=state.live.steadied(time, place, step, self.options.steady))
-            tracked = replace(tracked, motion=replace(tracked.motion, image_shift=state.live.shift))
+            tracked = replace(tracked, motion=replace(tracked.motion, image_shift=state.live.shift.to(tracked.path)))
         self._state = state
         return tracked
 

@@ -5,7 +5,6 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -17,10 +16,7 @@ from rsvib_torch.numerics.tables import Array
 from rsvib_torch.registration.corners import CornerFollower, Corners, repetition
 from rsvib_torch.stacks.recorded_motion import compared_pairs
 from rsvib_torch.tracking.camera_path import WINDOW_FRAMES
-from rsvib_torch.video.video_frames import Frame
-
-if TYPE_CHECKING:
-    from rsvib_torch.video.video_passes import VideoPasses
+from rsvib_torch.video.video_frames import Frame, VideoFrames
 
 PART_FRAMES = 32  # of a part of the video, which is encoded by itself; an interrupted run repeats at most one part
 CHECKED_FRAMES = 8  # of each part, in which the shaking is measured
@@ -35,20 +31,33 @@ _CUT, _THUMBNAIL, _FEW = 0.8, (16, 16), 64
 class FirstPass:
     """Follows corners from each usable frame of a video to the next one; copies of the frame before do not count."""
 
-    def __init__(self, video: "VideoPasses", times: Array) -> None:
-        """A pass through a video, the middles of whose frames are at ``times`` (N,) in s."""
-        self._video, self._timing, self._times = video, video.frames.job.timing, times
+    def __init__(
+        self,
+        frames: VideoFrames,
+        decoded: Generator[Frame | str, None, None],
+        starts: list[float],
+        times: Array,
+        *,
+        for_gyroscope: bool,
+        stabilised: bool,
+    ) -> None:
+        """A pass through the ``decoded`` frames of a video, whose exposures start at ``starts`` in s.
+
+        Their middles are at ``times`` (N,) in s. The camera may have ``stabilised`` its images.
+        """
+        self._frames, self._decoded, self._starts, self._times = frames, decoded, starts, times
+        self._timing, self._for_gyroscope, self._stabilised = frames.job.timing, for_gyroscope, stabilised
         self.taken = times.copy()  # of copies, when the frame before was taken
         self.faults: dict[int, str] = {}  # number of each frame that cannot be used, with the reason
         self.corners: dict[int, Corners] = {}  # between a frame and the next one, of the first frames of each part
         self.compared: dict[int, Corners] = {}  # with a gyroscope, likewise, of some frames of the video
         self.repetitions: dict[int, Array | None] = {}  # without a gyroscope, of each part
-        self._chosen = compared_pairs(len(times)) if video.rates is not None else []
+        self._chosen = compared_pairs(len(times)) if for_gyroscope else []
         self._others: set[int] = set()  # frames that show something else than the frame before
         self._before: tuple[int, NDArray[np.uint8]] | None = None  # the usable frame before, and its number
         self._changes: deque[float] = deque(maxlen=_MEMORY)  # counts, of the frames before
         self._waiting: list[tuple[int, NDArray[np.uint8], float]] = []  # possible copies of it, and their changes
-        self._follower = CornerFollower(self._timing, compare_blur=video.rates is None and not video.stabilised)
+        self._follower = CornerFollower(self._timing, compare_blur=not for_gyroscope and not stabilised)
 
     @property
     def cuts(self) -> list[int]:
@@ -63,7 +72,7 @@ class FirstPass:
                 yield from corners
 
     def _followed(self) -> Generator[tuple[Corners | None, ...], None, None]:
-        with closing(self._video.decoded()) as frames:
+        with closing(self._decoded) as frames:
             for index, frame in enumerate(frames):
                 yield self._next(index, frame)
 
@@ -72,7 +81,7 @@ class FirstPass:
         if isinstance(frame, str):
             self.faults[index] = frame
             return ()
-        grey, before = self._video.frames.grey(frame), self._before
+        grey, before = self._frames.grey(frame), self._before
         changed = math.inf if before is None else cv2.norm(grey, before[1], cv2.NORM_L1) / grey.size
         usual = float(np.median(self._changes)) if len(self._changes) >= _MEMORY // 2 else 0.0
         if before is None or changed > _COPY * usual:
@@ -91,9 +100,9 @@ class FirstPass:
         if grey.min() == grey.max():
             self.faults[index] = f"frame {index} is constant"
             return ()
-        if self._video.rates is None and index // PART_FRAMES not in self.repetitions:
+        if not self._for_gyroscope and index // PART_FRAMES not in self.repetitions:
             self.repetitions[index // PART_FRAMES] = repetition(grey)
-        corners = self._follower.next(grey, self._video.starts[index])
+        corners = self._follower.next(grey, self._starts[index])
         self._before = index, grey
         if before is None:
             return ()
@@ -105,9 +114,9 @@ class FirstPass:
             if corners is not None and index % PART_FRAMES < CHECKED_FRAMES:
                 self.corners[index - 1] = corners
             if index - 1 in self._chosen:
-                starts = self._video.starts[index - 1 : index + 1]
+                starts = self._starts[index - 1 : index + 1]
                 self.compared[index - 1] = followed_pair(before[1], grey, starts, self._timing)
-        if corners is not None and self._video.stabilised:
+        if corners is not None and self._stabilised:
             both = np.broadcast_to(self.taken[[before[0], index]], corners.times.shape)
             corners = replace(corners, times=both)
         return (corners,)

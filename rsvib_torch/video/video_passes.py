@@ -87,7 +87,10 @@ class VideoPasses:
         timing = self.frames.job.timing
         half = timing.time_to_middle(self.frames.size[int(timing.scan_axis)])
         times = np.array(self.starts) + half
-        found = FirstPass(self, times)
+        by_rates = self.rates is not None
+        found = FirstPass(
+            self.frames, self.decoded(), self.starts, times, for_gyroscope=by_rates, stabilised=self.stabilised
+        )
         if self.rates is None:
             with ONE_BLAS_THREAD:
                 path = camera_path(found.pairs(progress), timing, self.frames.size, has_tones=not self.stabilised)
