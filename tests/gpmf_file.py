@@ -28,9 +28,11 @@ def packet(rates, *, total, orientation=b"", stamp=None, first=None, turned=None
     if first is not None:
         accelerations = entry(b"STMP", b"J", 8, 1, struct.pack(">Q", first)) + accelerations
     if turned is not None:  # quaternions of the images against the camera
-        quaternions = np.round(32767 * np.asarray(turned)).astype(">i2")
+        is_whole = np.isfinite(turned).all()
+        quaternions = np.round(32767 * np.asarray(turned)).astype(">i2" if is_whole else ">f4")
         accelerations = entry(b"SCAL", b"s", 2, 1, struct.pack(">h", 32767)) + accelerations
-        accelerations += entry(b"IORI", b"s", 8, len(quaternions), quaternions.tobytes())
+        kind, size = (b"s", 8) if is_whole else (b"f", 16)
+        accelerations += entry(b"IORI", kind, size, len(quaternions), quaternions.tobytes())
     more = b""
     if exposures is not None:  # s, of the frames
         values = entry(b"SHUT", b"f", 4, len(exposures), np.asarray(exposures).astype(">f4").tobytes())

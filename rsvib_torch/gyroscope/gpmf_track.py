@@ -67,7 +67,7 @@ class CameraTrack:
                     exposures.append(shutter)
                 if quaternions.shape[1] == 4:  # w, x, y, z
                     angles = 2 * np.arctan2(np.linalg.norm(quaternions[:, 1:], axis=1), np.abs(quaternions[:, 0]))
-                    turned = float(angles.max(initial=turned))
+                    turned = float(np.fmax.reduce(angles, initial=turned))  # those that are NaN do not count
         return cls(np.concatenate(times), np.concatenate(exposures), turned)
 
     @property

@@ -10,7 +10,8 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.registration.corners import Corners, reduction
 from rsvib_torch.tracking.other_readouts import compared_readouts
-from rsvib_torch.tracking.window_fit import ROUNDS, Tone, WindowPath, averaging, fit_window, robust_weights
+from rsvib_torch.tracking.window_fit import ROUNDS, WindowPath, averaging, fit_window, robust_weights
+from rsvib_torch.tracking.window_tones import Tone
 
 WINDOW_FRAMES = 96  # of one fit; amplitudes and frequencies may change from window to window
 # px, of the reduced frames. A window whose corners are left with more is fitted again in short windows, with tones that

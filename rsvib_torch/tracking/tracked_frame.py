@@ -47,6 +47,7 @@ class TrackedTones:
     # displacements of the rows of the last frame that was measured and of the one before, with the same time origin
     measurements: Measurements
     findings: Findings  # reasons against each axis
+    apart: float  # px, by which the halves of the rows of the last measured frame move apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +60,8 @@ class TrackedFrame:
             ``"unusable"``: the frame is constant, or a copy of the frame before.
         motion: The motion to remove, in image axes; its time origin is the middle of the frame. Axes whose vibration is
             not reliable are still.
-        path: (2,) px, axes (x, y): image motion without vibration from the first tracked frame to the middle of this
-            one; NaN if it is not known.
+        path: (2,) px, axes (x, y): image motion without the tones of ``motion`` from the first tracked frame to the
+            middle of this one; NaN if it is not known.
         detected: Whether the vibration was searched for, as ``detect_vibration`` does, after this frame.
         measurements: Displacements of the rows of this frame and of the frame before, in row order; times count
             from the first row of this frame. None if they were not measured.
@@ -95,7 +96,7 @@ class TrackedFrame:
 
         Another thread may use it while the next frame is tracked.
         """
-        if self.tones is None:
+        if self._as_taken:
             return unchanged_frames(self.frame, joint=False)[0]
         frame = self._timed_from_middle
         with torch.no_grad():
@@ -106,7 +107,7 @@ class TrackedFrame:
         """(H, W) bool, pixels of the restored frame that the sensor recorded; the others are extrapolated."""
         everything = torch.ones_like(self.frame.images[0, 0, 0], dtype=torch.bool)
         everything = frames_from_row_order(everything, self.frame.image_timing)
-        if self.tones is None:
+        if self._as_taken:
             return everything
         height, width = everything.shape
         return visible_pixels(self._timed_from_middle.image_timing, self.motion, (height, width), 1)[0][0]
@@ -141,6 +142,10 @@ class TrackedFrame:
             interval=float(measurements.interval.mean()),
         )
         return results[0]
+
+    @property
+    def _as_taken(self) -> bool:
+        return self.tones is None and not bool(self.motion.image_shift.any())
 
     @property
     def _timed_from_middle(self) -> PreparedFrames:

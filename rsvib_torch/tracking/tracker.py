@@ -61,15 +61,22 @@ from rsvib_torch.registration.register import fits_frame
 from rsvib_torch.registration.row_spectra import RowSpectra
 from rsvib_torch.restoration.restore import WITH_SATURATION
 from rsvib_torch.results.reason import Reason
+from rsvib_torch.tracking.live_path import LivePath, step_of_frames, step_of_rows
 from rsvib_torch.tracking.tone_filter import ToneFilter
 from rsvib_torch.tracking.tracked_frame import TrackedFrame, TrackedTones, TrackingState, displacement_std_at_frame
 
 _MAX_PREDICTED_STD = 0.5  # px; the gradients of rows reach a few tenths of a pixel, and there are several rounds
 _MAX_UNMEASURED_STD = 0.1  # px; paths of hand-held cameras are predicted within 0.25 px, with 1 px within 0.6 px
 _MAX_UNEXPLAINED = 1.0  # px, residual displacement of rows; they are not measured correctly over larger distances
+# px, by which a frame moves further than predicted, beyond which its rows are measured around that place: by up to 8 px
+# where a heel strikes. Frames whose rows vibrate by 1 px seem to move by up to 1.2 px, with which rows became worse
+_MAX_MISSED = 2.0
 # of the rms displacement by the tones, residual beyond which they are not removed. Where a vibration of 2 px stops, the
 # first frame at rest had 0.12 to 0.2, and would become worse by 19 dB
 _MAX_LEFT = 0.1
+# px, between the halves of the rows, beyond which rows of a steady image are not moved by the path: 0.01 to 0.04 of
+# hands that walk and roll, 0.09 to 1.5 where a person crosses, whom the rows would follow
+_MAX_APART = 0.07
 _MAX_CHANGE = 0.2  # px, by which a round may change the displacement of a row; otherwise the frame is measured again
 _MAX_ROUNDS = 3  # measurements of one frame
 _MAX_PATH = 4.0  # px; the scene may move so far before its gradients are computed again
@@ -141,8 +148,10 @@ class _State:
     time: float = -math.inf  # s, exposure start of the last frame
     frames: tuple[_GreyFrame, ...] = ()  # the last ones that could be used, at most a window
     track: _Track | None = None  # the motion that is followed; None if it is not known
-    path: Array = field(default_factory=lambda: np.zeros(2))  # (2,) px, image motion to the time of the filter
-    places: tuple[tuple[float, Tensor], ...] = ()  # times and paths of the frames that the steady image follows
+    path: Array = field(default_factory=lambda: np.zeros(2))  # (2,) px, as predicted, to the time of the filter
+    live: LivePath = field(
+        default_factory=LivePath
+    )  # from frame to frame, and where the steady image shows the last one
     untried: int = 0  # frames since the last attempt to detect the vibration
     attempts: int = 0  # to detect the vibration, since the rows last agreed with the tones
     contradictions: int = 0  # consecutive frames, and starts of the filter, whose rows contradict the tones
@@ -235,7 +244,8 @@ class VibrationTracker:
         state = replace(self._state, time=time, lost="")
         if latest.shows_nothing_new(before):
             self._state = state
-            return self._result(prepared, state, usable=False)
+            tracked = self._result(prepared, state, usable=False)
+            return replace(tracked, motion=replace(tracked.motion, image_shift=state.live.shift.to(tracked.path)))
         longest = MAX_SPAN * self._rows.row_time  # s; frames further apart do not resolve frequencies
         recent = tuple(frame for frame in state.frames if time - frame.time <= longest)
         state = replace(state, frames=(*recent, latest)[-self.options.window :], untried=state.untried + 1)
@@ -254,10 +264,10 @@ class VibrationTracker:
 
         # 3. The result, moved to where the steady image is.
         tracked = self._result(prepared, state)
-        if self.options.steady and tracked.tones is not None:
-            places = (*state.places, (time, tracked.path))
-            state = replace(state, places=tuple(place for place in places if place[0] >= time - self.options.steady))
-            tracked = tracked.moved_to(_end_of_line(state.places))
+        if self.options.steady:
+            place, step = None if tracked.tones is None else tracked.path, time - self._state.time
+            state = replace(state, live=state.live.steadied(time, place, step, self.options.steady))
+            tracked = replace(tracked, motion=replace(tracked.motion, image_shift=state.live.shift.to(tracked.path)))
         self._state = state
         return tracked
 
@@ -283,9 +293,8 @@ class VibrationTracker:
         centre = 0.5 * (track.start + frame.time) + 0.5 * height * self._rows.row_time
         prediction = track.filter.predicted(centre)
         fit, step = prediction.as_fit(centre), centre - track.filter.time
-        size, seconds = max(frame.images.shape[-2:]), frame.time - track.start + height * self._rows.row_time
         is_accurate = prediction.displacement_std() < _MAX_PREDICTED_STD  # not if it is not a number
-        if not (is_accurate and _is_possible(fit, size, seconds)):
+        if not (is_accurate and self._is_possible(track, frame, fit)):
             return state.without_track("the motion cannot be predicted")
         path = state.path + track.filter.path(step)
 
@@ -301,6 +310,10 @@ class VibrationTracker:
         group = FrameGroups(track.spectra.followed_by(spectra), tensor(starts)[None].to(device))
         gain = offset_gain(fit.frequencies, np.diff(starts))[0] * fit.active[0]
         noise_factor = np.maximum(0.5 * np.square(gain.max(-1)), 1.0)
+        if (missed := self._missed(state, motion_of_fit(fit), starts)) is not None:
+            drift, scene = fit.drift.copy(), None
+            drift[0, :, 0] += missed / float(np.diff(starts)[0])
+            fit = replace(fit, drift=drift)
         for _ in range(_MAX_ROUNDS):
             anchor, known = (path, None) if scene is None else (scene.path, scene.gradients)
             motion = replace(motion_of_fit(fit), image_shift=tensor(path - anchor)[None])
@@ -319,18 +332,34 @@ class VibrationTracker:
         scene = scene or _Scene(gradients, differential_motion([gradients], 1, uniform=False), path)
         scene = replace(scene, age=scene.age + 1)
         state = replace(state, path=state.path - corrected.path(-step))
+        return self._followed(track, state, corrected, measurements, scene, spectra)
 
-        # 4. Judge the tones by the rows. Rows far from where the motion places them are not measured correctly.
+    def _followed(
+        self,
+        track: _Track,
+        state: _State,
+        corrected: ToneFilter,
+        measurements: Measurements,
+        scene: _Scene,
+        spectra: RowSpectra,
+    ) -> _State:
+        """The state with a corrected filter, whose tones are judged by the rows of the last frame."""
+        # 1. Rows far from where the motion places them are not measured correctly.
+        frame, centre, height = state.frames[-1], corrected.time, state.frames[-1].images.shape[-2]
+        by_tones, by_drift = corrected.explained(measurements, centre)
         residual = measurements.displacements - by_tones - by_drift
         other = OtherMotion.of(measurements, by_tones, residual, scene.differential)
         at_middle = corrected.predicted(frame.time + self._rows.time_to_middle(height), mixed=False)
         fit, growth = at_middle.as_fit(frame.time), at_middle.growth()
-        if not (other.unexplained.max() < _MAX_UNEXPLAINED and _is_possible(fit, size, seconds)):
+        if not (other.unexplained.max() < _MAX_UNEXPLAINED and self._is_possible(track, frame, fit)):
             return state.without_track("the rows are far from where the motion places them")
-        aliasing = table(scene.gradients.aliasing)
-        fit = with_unknown_amplitudes(
-            fit, aliasing, other.unexplained, np.diff(starts), self._rows.exposure_time, known=0
-        )
+        # 2. How far the frame has moved from the one before.
+        middle = 0.5 * (track.start + frame.time) + self._rows.time_to_middle(height) - centre
+        step = step_of_rows(measurements, measurements.displacements - by_tones, middle)
+        state = replace(state, live=replace(state.live, moved=state.live.moved + step))
+        # 3. The verdict on the tones.
+        aliasing, interval = table(scene.gradients.aliasing), np.array([frame.time - track.start])
+        fit = with_unknown_amplitudes(fit, aliasing, other.unexplained, interval, self._rows.exposure_time, known=0)
         measurements = replace(measurements, exposure_starts=measurements.exposure_starts + (centre - frame.time))
         tones = self._judged(frame, fit, growth, measurements, other)
         trusted = np.array([not against for against in tones.findings])
@@ -341,6 +370,29 @@ class VibrationTracker:
         if any(contradicted_axes(tones.findings)):
             return replace(state, track=track, contradictions=state.contradictions + 1)
         return replace(state, track=track, contradictions=0, attempts=0)
+
+    def _is_possible(self, track: _Track, frame: _GreyFrame, fit: ToneFit) -> bool:
+        """Whether tones, and the image motion over both frames, are smaller than a frame; not if they are NaN."""
+        size, readout = max(frame.images.shape[-2:]), frame.images.shape[-2] * self._rows.row_time
+        seconds = frame.time - track.start + readout
+        moved = np.abs(fit.drift) @ np.array([seconds, 0.5 * seconds**2])
+        is_small = bool((np.abs(fit.coefficients) < size).all() and (moved < size).all())
+        return is_small and bool(np.isfinite(fit.frequencies).all() and np.isfinite(fit.covariance).all())
+
+    def _missed(self, state: _State, motion: Vibration, starts: Array) -> Array | None:
+        """(2,) px, how much further the last frame has moved than predicted; None unless that is too far for its rows.
+
+        Exposures start at ``starts`` (2,) in s; the time origin is that of the motion.
+        """
+        before = [frame for frame in state.frames if state.track is not None and frame.time == state.track.start]
+        images = state.frames[-1].images
+        step = step_of_frames(before[0].images, images) if before else None
+        if step is None:
+            return None
+        rows = self._rows.row_starts(1, images.shape[-2])[0, ::8]
+        first, last = (motion.mean_displacement(rows + start, self._rows.exposure_time) for start in starts.tolist())
+        missed = step - table(last - first).reshape(-1, 2).mean(0)
+        return missed if np.abs(missed).max() > _MAX_MISSED else None
 
     def _judged(
         self, frame: _GreyFrame, fit: ToneFit, growth: Array, measurements: Measurements, other_motion: OtherMotion
@@ -366,7 +418,8 @@ class VibrationTracker:
             with_remedy(_of_present_tones(of_axis, tones), "use frames at shorter intervals")
             for of_axis, tones in zip(findings, fit.active[0].sum(-1), strict=True)
         )
-        return TrackedTones(frame.time, fit, growth, measurements, findings)
+        apart = float(np.max(other_motion.differential))
+        return TrackedTones(frame.time, fit, growth, measurements, findings, apart)
 
     def _predicted(self, state: _State) -> _State | None:
         """The state with predicted tones of the last frame; None if the frame must be measured.
@@ -475,7 +528,9 @@ class VibrationTracker:
         # 3. The last two frames, which the filter starts between.
         (before, last), number = state.frames[-2:], self.options.columns
         columns = slice(None) if number is None else detailed_parts(last.images[:1], number)[0]
-        return self._measured(replace(state, track=_Track(started, before.spectra(columns), before.time, columns)))
+        measured = self._measured(replace(state, track=_Track(started, before.spectra(columns), before.time, columns)))
+        # The step between the two frames is a part of the path already, unless they were not followed.
+        return measured if state.track is None else replace(measured, live=state.live)
 
     # Results
 
@@ -492,14 +547,19 @@ class VibrationTracker:
             # The time origin of the tones is the first row, that of the motion the middle of the frame.
             half = self._rows.time_to_middle(prepared.images.shape[-2])
             motion = motion_of_fit(replace(tones.fit, centre=tones.fit.centre - half), device)[0]
-            # An axis moves if its tones were reliable in one of the last frames.
+            # The tones of an axis are removed if they were reliable in one of the last frames. Rows of a steady image
+            # are moved by the path as well, unless something moves across a part of them.
             trusted = tensor(np.any(track.trusted, 0)).to(device)
-            is_followed = ~trusted.new_tensor(contradicted_axes(tones.findings))
-            followed = is_followed if self.options.steady else trusted
+            followed = trusted | bool(self.options.steady and tones.apart < _MAX_APART)
+            # The place of the restored frame: that of the last measured one, the path from there, and the mean over the
+            # rows of tones that stay.
+            stay = replace(motion.scaled(0.0), amplitude=motion.amplitude * ~trusted[:, None])
+            rows = self._rows.row_starts(1, prepared.images.shape[-2])[0, ::8] - half
+            stays = table(stay.mean_displacement(rows.to(device), self._rows.exposure_time)).mean(0)
+            since, until = (track.filter.path(start + half - track.filter.time) for start in (track.start, state.time))
+            path = offsets_from_row_order(tensor(state.live.moved + stays + until - since).to(device), self.timing)
             motion = replace(motion.scaled(followed), amplitude=motion.amplitude * trusted[:, None])
             motion = motion.from_row_order(self.timing)
-            place = state.path + track.filter.path(state.time + half - track.filter.time)
-            path = offsets_from_row_order(tensor(place).to(device), self.timing)
             label = "searching" if state.contradictions >= _PATIENCE else "tracking"
         return TrackedFrame(
             time=state.time,
@@ -513,13 +573,6 @@ class VibrationTracker:
             options=self.options,
             lost=state.lost,
         )
-
-
-def _is_possible(fit: ToneFit, size: float, seconds: float) -> bool:
-    """Whether tones, and the image motion in some seconds, are smaller than a frame of ``size`` px; not if NaN."""
-    moved = np.abs(fit.drift) @ np.array([seconds, 0.5 * seconds**2])
-    is_small = bool((np.abs(fit.coefficients) < size).all() and (moved < size).all())
-    return is_small and bool(np.isfinite(fit.frequencies).all() and np.isfinite(fit.covariance).all())
 
 
 def _plausible(found: Attempt) -> Tensor:
@@ -540,12 +593,3 @@ def _of_present_tones(reasons: tuple[Reason, ...], tones: int) -> tuple[Reason, 
     """
     ended = [one.code == "tone_too_small" for one in reasons]
     return reasons if sum(ended) == tones else tuple(one for one in reasons if one.code != "tone_too_small")
-
-
-def _end_of_line(places: tuple[tuple[float, Tensor], ...]) -> Tensor:
-    """(2,) px, place at the last time of the straight line that fits paths (2,) at times in s."""
-    last, path = places[-1]
-    if len(places) < 3:
-        return path
-    times = np.array([time for time, _ in places]) - last
-    return path.new_tensor(np.polyfit(times, table(torch.stack([path for _, path in places])), 1)[1])

@@ -31,8 +31,9 @@ from rsvib_torch.stacks.manifest import fingerprint, manifest_header, rms_shakin
 from rsvib_torch.stacks.memory import share_one_heap
 from rsvib_torch.stacks.run_folder import FileRun, RunFolder, StackReport
 from rsvib_torch.video import Margins
+from rsvib_torch.video.first_pass import PART_FRAMES
 from rsvib_torch.video.video_frames import Frame, FrameTrack, VideoFrames
-from rsvib_torch.video.video_passes import PART_FRAMES, VideoMotion, VideoPasses, shakes_more
+from rsvib_torch.video.video_passes import VideoMotion, VideoPasses, shakes_more
 
 _TOGETHER = ("joint", "scale", "mosaic", "optics")  # options of restore that frames one by one do not have
 _JUDGED_FRAMES = 4  # of each part, whose shaking decides whether it is restored

@@ -1,65 +1,39 @@
 """Passes through a video: the motion of all frames, where they are moved to, verdict and record of the parts."""
 
 import math
-from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from itertools import combinations, pairwise
+from itertools import pairwise
 
-import cv2
 import numpy as np
-import torch
-from numpy.typing import NDArray
 
-from rsvib_torch.detection.sensitivity import timing_sensitivity, with_row_time_std
-from rsvib_torch.detection.tones.fit import ToneFit
-from rsvib_torch.detection.verdict import exposure_reasons
 from rsvib_torch.execution.parallel import ONE_BLAS_THREAD, prefetched
-from rsvib_torch.gyroscope.corner_tracks import followed_pair, tracks_of_pairs
+from rsvib_torch.gyroscope.corner_tracks import tracks_of_pairs
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
 from rsvib_torch.gyroscope.rotation_alignment import AlignOptions, RotationAlignment, align_rates
 from rsvib_torch.imaging.trajectory import places_at_rest, recorded_offsets
 from rsvib_torch.io.video import VideoReader
 from rsvib_torch.motion.camera import Camera
-from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.spline import FreeMotion
-from rsvib_torch.motion.vibration import Vibration, VibrationStd
+from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import ProcessVideoOptions
-from rsvib_torch.registration.corners import CornerFollower, Corners, reduction, repetition
+from rsvib_torch.registration.corners import Corners
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
 from rsvib_torch.stacks.job import stored_frame
-from rsvib_torch.stacks.recorded_motion import compared_pairs
 from rsvib_torch.stacks.windows import WindowRecord
-from rsvib_torch.text import number_of
-from rsvib_torch.tracking.camera_path import WINDOW_FRAMES, CameraPath, camera_path, shake
-from rsvib_torch.tracking.window_fit import SIGNIFICANT, Tone, WindowPath, WindowTone
+from rsvib_torch.tracking.camera_path import CameraPath, camera_path, shake
+from rsvib_torch.tracking.window_tones import Tone
 from rsvib_torch.video import Margins
+from rsvib_torch.video.first_pass import CHECKED_FRAMES, PART_FRAMES, FirstPass
+from rsvib_torch.video.part_detection import part_detection, tone_tables
 from rsvib_torch.video.recorded_rotation import RecordedRotation
 from rsvib_torch.video.steadying import steady_shifts
 from rsvib_torch.video.video_frames import Frame, FrameTrack, VideoFrames
 
-PART_FRAMES = 32  # of a part of the video, which is encoded by itself; an interrupted run repeats at most one part
-_CHECKED_FRAMES = 8  # of each part, in which the shaking is measured
 _AHEAD = 4  # frames decoded before they are used
-_GAIN_ERROR = 0.02  # of an amplitude: the mean over the patch of a corner is known so well (52 to 205 Hz: 0.4 to 1.6 %)
-# px^-2, of the third cumulant of the path within an exposure, by which a blurred corner is found beside the mean of the
-# path. 36 tones of 33 to 177 Hz and 0.4 to 2.5 px behind 4 ms: 0.07 to 0.34, amplitudes were up to 15 % too large
-_BLUR_BIAS = 0.15
-_SAME_ALIAS = 0.01  # periods per frame; tones are separated from 0.02 on in a window of 96 frames
-# rad, of the phase of a tone from a frame to the next one: with every seventh frame missing, 93.0 and 121.0 Hz were
-# stated as 93.47 and 121.15 Hz and jumped by 0.37 and 0.22 rad
-_MAX_JUMP = 0.1
-_MAX_APART = 0.25  # of a tone, left in a third of the rows or columns: up to 0.14 of tones of cameras, at night
-# Of the usual change from frame to frame: at least 0.18 in 36 clips that a hand holds, and at most 0.12 of copies in a
-# video of 24 frames per second that is stored as 30. More frames in a row are no copies: a pan has ended, or it is dark
-_COPY, _MEMORY, _MOST_IN_A_ROW = 0.15, 8, 3
-# Of the contrast of two frames of 16 x 16 px, their mean difference: at least 0.9 at 14 cuts, at most 0.7 in 13 clips.
-# Light that flickers more leaves many corners; those of unrelated frames that agree by chance are few
-_CUT, _THUMBNAIL, _FEW = 0.8, (16, 16), 64
-_MAX_COPIES = 0.05  # of the frames; with more, frames were taken at other times than stored: 143 Hz became 149 Hz
 # Of the distance at which a scene repeats itself, a step from frame to frame, along it, up to which the part of the
 # video shows by how much the frames move; a larger one may be another by the whole distance
 _MOST_OF_REPETITION = 0.25
@@ -113,7 +87,10 @@ class VideoPasses:
         timing = self.frames.job.timing
         half = timing.time_to_middle(self.frames.size[int(timing.scan_axis)])
         times = np.array(self.starts) + half
-        found = _FirstPass(self, times)
+        by_rates = self.rates is not None
+        found = FirstPass(
+            self.frames, self.decoded(), self.starts, times, for_gyroscope=by_rates, stabilised=self.stabilised
+        )
         if self.rates is None:
             with ONE_BLAS_THREAD:
                 path = camera_path(found.pairs(progress), timing, self.frames.size, has_tones=not self.stabilised)
@@ -218,7 +195,7 @@ class VideoPasses:
         Before and after are of the same corners: in other frames, others are found, some of them on cars that pass.
         """
         measured: dict[int, Array] = {}  # (2, 3) px, before and after: x, y and rows, of a frame and the next one
-        for pair in pairwise(tracks[:_CHECKED_FRAMES]):
+        for pair in pairwise(tracks[:CHECKED_FRAMES]):
             raw = motion.corners.get(pair[0].index)
             if raw is not None:
                 both = shake(raw), shake(self._restored_corners(motion, pair, raw))
@@ -264,7 +241,7 @@ class VideoPasses:
     ) -> WindowRecord:
         """The record of a part of the video, which was left alone if restoration makes it worse."""
         path = motion.path
-        detection = self._detection(path, motion, tracks) if isinstance(path, CameraPath) else None
+        detection = part_detection(self.frames, path, motion.times, tracks) if isinstance(path, CameraPath) else None
         left = []
         if detection is not None and self.options.steady == 0:  # the rows of axes without tones are not moved
             left = [
@@ -292,238 +269,7 @@ class VideoPasses:
             shaking=shaking,
         )
 
-    def _detection(self, path: CameraPath, motion: VideoMotion, tracks: list[FrameTrack]) -> DetectedVibration:
-        """The vibration in the middle of a part; its time origin is the start of the first frame of the part."""
-        times = motion.times
-        middle = float(times[tracks[len(tracks) // 2].index])
-        window = path.nearest(middle)
-        tones = [tone.at(middle - window.origin, tracks[0].time - window.origin) for tone in window.tones]
-        amplitude, frequency, phase, size, rate = tone_tables(tones, 2)
-        apparent, amplitude = amplitude, self._without_blur(amplitude, frequency)
-        size = np.hypot(size, _GAIN_ERROR * apparent)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            phase_std = np.where(amplitude > 0, size / apparent, math.inf)
-            period_std = np.where(frequency > 0, rate / frequency**2, math.inf)
-        size = np.hypot(size, 0.5 * (apparent - amplitude))  # blur does not turn the phase
-        unknown = np.full(2, math.inf)
-        values = (size, rate, period_std, phase_std, unknown, unknown)
-        begin = times[[tracks[0].index]]
-        velocity, acceleration = (window.path(begin, order)[0, :2] for order in (1, 2))
-        vibration = Vibration(amplitude, frequency, phase, velocity, acceleration)
-        findings = self._findings(tones, window)
-        copies = np.count_nonzero(np.diff(times) <= 0) / len(times)
-        against = [
-            Reason(code, None, value, allowed)
-            for code, value, allowed in (
-                ("corners_unexplained", window.residual_of_most, path.allowed),
-                ("frames_repeated", copies, _MAX_COPIES),
-            )
-            if value > allowed
-        ]
-        against += exposure_reasons(self.frames.job.timing.in_row_order(), *window.blur)
-        if window.other_readout is not None:
-            name, stated, other = window.other_readout
-            against.append(Reason("readout_contradicted", None, stated, other, {"other": name}))
-        if against:
-            findings = tuple((*(one for one in of if one.code != "no_tone"), *against) for of in findings)
-        timing, std = self.frames.job.timing, VibrationStd(*(torch.from_numpy(np.array(value)) for value in values))
-        coefficients = amplitude * np.exp(1j * (phase - 0.5 * math.pi))
-        fit = ToneFit(
-            coefficients=coefficients[None],
-            frequencies=frequency[None],
-            active=amplitude[None] > 0,
-            drift=velocity[None, :, None],
-            covariance=np.empty((1, 0, 0)),
-            centre=np.zeros(1),
-        )
-        rows = self.frames.size[int(timing.scan_axis)]
-        sensitivity = timing_sensitivity(fit, timing.in_row_order(), len(tracks), rows)[0]
-        return DetectedVibration(
-            vibration=vibration,
-            std=with_row_time_std(std, vibration, sensitivity, timing),
-            gain=vibration.gain(timing.frame_period),
-            residual=torch.full((2,), window.residual, dtype=torch.float64),
-            reliable=torch.tensor([not reasons for reasons in findings]),
-            findings=findings,
-            assumptions=self._assumptions(window),
-        )
-
-    def _assumptions(self, window: WindowPath) -> tuple[str, ...]:
-        """What the corners of a window cannot contradict."""
-        if not window.agreeing:
-            return ()
-        first, more = " or ".join(window.agreeing[:2]), len(window.agreeing) - 2
-        others = f" (and {number_of(more, 'other readout')})" if more > 0 else ""
-        row_time = f"row_time={self.frames.job.timing.row_time:.4g} s"
-        return (f"{row_time}: the corners agree as well with rows that are read {first}{others}",)
-
-    def _without_blur(self, amplitude: Array, frequency: Array) -> Array:
-        """Amplitudes in px of tones in Hz without what the blur of the corners adds to them.
-
-        Corners lie where their blur is strongest, near the turning points of the motion. A tone of amplitude a with the
-        exposure E appears as ``a + k a^3``, ``k = 3/4 c (1 + s(2 f E) - 2 s(f E)^2)``, ``s(x) = sin(pi x) / (pi x)``:
-        c times the third cumulant of the path. Frames are restored with what appears.
-        """
-        turns = frequency * self.frames.job.timing.exposure_time
-        of_path = 1.0 + np.sinc(2.0 * turns) - 2.0 * np.sinc(turns) ** 2
-        cubic = 0.75 * _BLUR_BIAS * of_path / reduction(*self.frames.size) ** 2
-        true = amplitude
-        for _ in range(8):  # Newton's method, from above
-            true = true - (true + cubic * true**3 - amplitude) / (1.0 + 3.0 * cubic * true**2)
-        return true
-
-    def _findings(self, tones: list[Tone], window: WindowPath) -> tuple[tuple[Reason, ...], ...]:
-        """Reasons against each axis.
-
-        Between frames, tones of f and f + n / T are the same; the times of the rows tell them apart. With a row time
-        that is wrong by 5 to 50 %, a tone of 93 Hz was explained by two, of 93 and 63 or 123 Hz, and one of 87 Hz along
-        the other axis was 57 Hz.
-        """
-        timing = self.frames.job.timing
-        aliases = [
-            Reason("tones_alias", AXIS_NAMES[first.axis], first.frequency, second.frequency)
-            for first, second in combinations(tones, 2)
-            if first.axis == second.axis
-            and (cycles := abs(first.frequency - second.frequency) * timing.frame_period) > 0.5
-            and abs(cycles - round(cycles)) < _SAME_ALIAS
-        ]
-        # Where frames are missing, the phase of a tone jumps, and others of 0.1 to 0.2 px seem to be beside it: 0.75 to
-        # 0.8 of the tone are not followed, of one that is switched on and off 0.6, at most 0.21 in 14 clips. Tones of
-        # the other axis are wrong as well then.
-        largest = {tone.axis: tone for tone in sorted(window.tones, key=lambda tone: tone.size)}
-
-        def changed(tone: WindowTone, change: float, allowed: float) -> Reason:
-            limit, details = allowed * tone.size, {"frequency": tone.frequency}
-            return Reason("tone_changes", AXIS_NAMES[tone.axis], change, limit, details)
-
-        jumps = [changed(tone, tone.jump * tone.size, _MAX_JUMP) for tone in largest.values() if tone.jump > _MAX_JUMP]
-        findings = []
-        for axis, name in enumerate(AXIS_NAMES[:2]):
-            of_axis = [tone for tone in tones if tone.axis == axis]
-            apart = max((tone.apart for tone in window.tones if tone.axis == axis), default=0.0)
-            known = any(abs(tone.coefficient) > SIGNIFICANT * tone.amplitude_std for tone in of_axis)
-            against = aliases[:1] if known else [Reason("no_tone", name)]
-            if axis in largest:
-                one = largest[axis]
-                bends = [changed(one, one.bend(), 1 / SIGNIFICANT)] if one.bend() > one.size / SIGNIFICANT else []
-                if jumps or bends:
-                    against = [*(jumps[:1] or bends), *aliases[:1]]
-            if apart > _MAX_APART:
-                against.append(Reason("rows_differ", name, apart, _MAX_APART))
-            fastest = max((tone.frequency for tone in of_axis), default=0.0)
-            if fastest * timing.exposure_time > 1:
-                against.append(Reason("tone_averaged_out", name, fastest, 1 / timing.exposure_time))
-            findings.append(tuple(against))
-        return tuple(findings)
-
-
-class _FirstPass:
-    """Follows corners from each usable frame of a video to the next one; copies of the frame before do not count."""
-
-    def __init__(self, video: VideoPasses, times: Array) -> None:
-        """A pass through a video, the middles of whose frames are at ``times`` (N,) in s."""
-        self._video, self._timing, self._times = video, video.frames.job.timing, times
-        self.taken = times.copy()  # of copies, when the frame before was taken
-        self.faults: dict[int, str] = {}  # number of each frame that cannot be used, with the reason
-        self.corners: dict[int, Corners] = {}  # between a frame and the next one, of the first frames of each part
-        self.compared: dict[int, Corners] = {}  # with a gyroscope, likewise, of some frames of the video
-        self.repetitions: dict[int, Array | None] = {}  # without a gyroscope, of each part
-        self._chosen = compared_pairs(len(times)) if video.rates is not None else []
-        self._others: set[int] = set()  # frames that show something else than the frame before
-        self._before: tuple[int, NDArray[np.uint8]] | None = None  # the usable frame before, and its number
-        self._changes: deque[float] = deque(maxlen=_MEMORY)  # counts, of the frames before
-        self._waiting: list[tuple[int, NDArray[np.uint8], float]] = []  # possible copies of it, and their changes
-        self._follower = CornerFollower(self._timing, compare_blur=video.rates is None and not video.stabilised)
-
-    @property
-    def cuts(self) -> list[int]:
-        """Numbers of the first frames of further shots; two other frames in a row are a flash."""
-        return [index for index in sorted(self._others) if not self._others & {index - 1, index + 1}]
-
-    def pairs(self, progress: Callable[[], None]) -> Iterator[Corners | None]:
-        """Corners between each usable frame and the one before; a thread follows them, up to a window ahead."""
-        with closing(prefetched(self._followed(), WINDOW_FRAMES)) as frames:
-            for corners in frames:
-                progress()
-                yield from corners
-
-    def _followed(self) -> Generator[tuple[Corners | None, ...], None, None]:
-        with closing(self._video.decoded()) as frames:
-            for index, frame in enumerate(frames):
-                yield self._next(index, frame)
-
-    def _next(self, index: int, frame: Frame | str) -> tuple[Corners | None, ...]:
-        """The corners between usable frames that are known with a frame."""
-        if isinstance(frame, str):
-            self.faults[index] = frame
-            return ()
-        grey, before = self._video.frames.grey(frame), self._before
-        changed = math.inf if before is None else cv2.norm(grey, before[1], cv2.NORM_L1) / grey.size
-        usual = float(np.median(self._changes)) if len(self._changes) >= _MEMORY // 2 else 0.0
-        if before is None or changed > _COPY * usual:
-            self._waiting.clear()
-            return self._used(index, grey, changed)
-        self.taken[index] = self.taken[before[0]]
-        self._waiting.append((index, grey, changed))
-        if len(self._waiting) <= _MOST_IN_A_ROW:
-            return ()
-        waiting, self._waiting = self._waiting, []
-        return tuple(corners for one in waiting for corners in self._used(*one))
-
-    def _used(self, index: int, grey: NDArray[np.uint8], changed: float) -> tuple[Corners | None, ...]:
-        """The corners between a frame that is no copy and the usable frame before, if there is one."""
-        self.taken[index], before = self._times[index], self._before
-        if grey.min() == grey.max():
-            self.faults[index] = f"frame {index} is constant"
-            return ()
-        if self._video.rates is None and index // PART_FRAMES not in self.repetitions:
-            self.repetitions[index // PART_FRAMES] = repetition(grey)
-        corners = self._follower.next(grey, self._video.starts[index])
-        self._before = index, grey
-        if before is None:
-            return ()
-        self._changes.append(changed)
-        if (corners is None or len(corners.rows) < _FEW) and _shows_other(grey, before[1]):
-            corners = None
-            self._others.add(index)
-        if before[0] == index - 1:
-            if corners is not None and index % PART_FRAMES < _CHECKED_FRAMES:
-                self.corners[index - 1] = corners
-            if index - 1 in self._chosen:
-                starts = self._video.starts[index - 1 : index + 1]
-                self.compared[index - 1] = followed_pair(before[1], grey, starts, self._timing)
-        if corners is not None and self._video.stabilised:
-            both = np.broadcast_to(self.taken[[before[0], index]], corners.times.shape)
-            corners = replace(corners, times=both)
-        return (corners,)
-
 
 def shakes_more(before: float, after: float) -> bool:
     """Whether frames shake visibly more, by rms motions in px, than before."""
     return after > _MORE_SHAKING * before + _VISIBLE_SHAKING
-
-
-def tone_tables(tones: list[Tone], axes: int) -> Array:
-    """Amplitude (px), frequency (Hz) and phase (rad) of ``Vibration``, of tones, the largest first: (5, axes, K).
-
-    The last two are the standard deviations of amplitude and frequency, which are infinite where there is no tone.
-    """
-    of_axes = [[tone for tone in tones if tone.axis == axis] for axis in range(axes)]
-    values = np.zeros((5, axes, max(1, *map(len, of_axes))))
-    values[3:] = math.inf
-    for axis, of_axis in enumerate(of_axes):
-        for number, tone in enumerate(sorted(of_axis, key=lambda tone: -abs(tone.coefficient))):
-            # Re c exp(i a) = |c| sin(a + arg c + pi/2)
-            phase = np.angle(tone.coefficient) + 0.5 * math.pi
-            size = abs(tone.coefficient), tone.frequency, phase, tone.amplitude_std, tone.frequency_std
-            values[:, axis, number] = size
-    return values
-
-
-def _shows_other(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> bool:
-    """Whether two frames (H, W) show different scenes, not one scene that moves by a part of the frame."""
-    small = [
-        cv2.resize(frame, _THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.float64) for frame in (first, second)
-    ]
-    contrast = min(float(frame.std()) for frame in small)
-    return float(np.abs(small[0] - small[1]).mean()) > _CUT * contrast

@@ -121,6 +121,14 @@ def test_images_that_the_camera_has_stabilised_are_stated(tmp_path, turned, stat
     assert np.allclose(found.rates.numpy(), RATES, atol=1e-9)
 
 
+@pytest.mark.parametrize("order", [slice(None), slice(None, None, -1)])
+def test_rotations_of_images_that_are_no_numbers_do_not_hide_the_others(tmp_path, order):
+    turned = [(0.9998, 0.0, 0.02, 0.0), (np.nan, np.nan, np.nan, np.nan)][order]
+    track = read_camera_track(mp4(tmp_path / "clip.mp4", packets_of(turned=turned)))
+    assert track.turned == pytest.approx(0.04, rel=1e-2)
+    assert track.stabilised
+
+
 def test_exposures_and_rotations_of_the_images_in_a_track(tmp_path):
     exposures = [[0.002] * 9, [0.002] * 5 + [0.004] * 4, [0.004] * 9]
     turned = [[0.9998, 0.0, 0.02, 0.0], [1.0, 0.0, 0.0, 0.0]]

@@ -351,3 +351,47 @@ def test_large_motions_with_gaps_end_in_a_search_and_not_in_an_error(steady):
         assert tracked.detection is None or tracked.detection.vibration.amplitude.max() < SIZE
     assert {""} < set(lost)
     assert torch.isfinite(tracker.update(frames[20], time + 1e9).restored).all()
+
+
+def walk(t):
+    """Sway and bob of a person, 2.5 steps per second, with heels that strike."""
+    since = np.mod(t, 0.4)
+    strike = 4.0 * np.exp(-since / 0.06) * np.sin(2 * np.pi * 11.0 * since)
+    return 6.0 * np.sin(2 * np.pi * 1.25 * t) + 0.3 * strike, 5.0 * np.cos(2 * np.pi * 2.5 * t) + strike
+
+
+def test_the_path_and_the_rows_of_a_steady_image_are_those_of_a_walk():
+    """Predicted steps were wrong by 7 px (rms along y), and most rows were not moved."""
+    motion, rows = Sines(amplitude=lambda t: (0 * t, 0 * t), path=walk), np.linspace(-0.4, 0.4, 33) * SIZE * 150e-6
+    tracked = track(taken(motion, 36), steady=1.0)[4:]
+    middles = np.array([one.time for one in tracked]) + MIDDLE
+    truth, found = np.stack(walk(middles), -1), np.stack([one.path.numpy() for one in tracked])
+    assert np.sqrt(np.square(np.diff(found - truth, axis=0)).mean(0)).max() < 0.4
+    wobble, left = [], []
+    for middle, one in zip(middles, tracked, strict=True):
+        moved = np.stack(walk(middle + rows), -1)
+        removed = one.motion.displacement(torch.as_tensor(rows)).numpy()
+        wobble.append(moved - moved.mean(0))
+        left.append(moved - removed - (moved - removed).mean(0))
+    assert (np.square(left).mean((0, 1)) < 0.25 * np.square(wobble).mean((0, 1))).all()
+
+
+def test_a_steady_image_does_not_jump_where_its_path_is_lost(steady):
+    """It jumped back by its whole displacement, and the video shook more than as taken."""
+
+    def path(t):
+        return 12.0 * np.sin(2 * np.pi * 0.9 * t), 0 * t
+
+    frames = taken(Sines(path=path), 16)
+    scene = torch.as_tensor(draw_scene(SIZE, SIZE + 400, seed=9), dtype=torch.float32)
+    others = [torch.full_like(frames[0], 0.5), *(scene[:, 100 * index : 100 * index + SIZE] for index in range(3))]
+    tracked = track(torch.stack([*frames, *others]), steady=0.5)
+    shifts = np.stack([one.motion.image_shift.numpy() for one in tracked])
+    unknown = np.array([bool(one.path.isnan().all()) for one in tracked])
+    assert not unknown[4:16].any()
+    assert unknown[[16, 18, 19]].all()
+    assert np.abs(shifts[15]).max() > 2.0
+    assert shifts[16] == pytest.approx(shifts[15])  # a frame that shows nothing
+    assert shifts[18:] == pytest.approx(shifts[17:19] * np.exp(-1 / RATE / 0.5), abs=1e-9)
+    assert not torch.equal(tracked[18].restored, others[2])
+    assert not tracked[18].visible.all()
