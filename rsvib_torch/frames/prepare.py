@@ -332,7 +332,7 @@ def _missing_pixels(frames: Tensor, ignore: object, allow_missing: bool, axis: i
 def _saturated_pixels(frames: Tensor, saturation: Saturation, full_scale: float | None) -> Tensor | None:
     """Mask of the pixels at the saturation level or above, in the unit of the user's frames; None if there are none."""
     if saturation == "auto":
-        saturation = None if frames.dtype.is_floating_point else _largest_count(frames, full_scale or 255.0)
+        saturation = None if frames.dtype.is_floating_point else largest_count(frames, full_scale or 255.0)
     if saturation is None:
         return None
     mask = frames >= check_number("saturation", saturation, above=0.0)
@@ -341,15 +341,16 @@ def _saturated_pixels(frames: Tensor, saturation: Saturation, full_scale: float 
     return mask if bool(mask.any()) else None
 
 
-def _largest_count(frames: Tensor, full_scale: float) -> float:
+def largest_count(frames: Tensor, full_scale: float) -> float:
     """The count that saturated pixels have: full scale, or the last multiple of the step of the counts up to it.
 
-    A camera of 12 bits, stored left-aligned in 16, has counts that are multiples of 16, of at most 65520.
+    A camera of 12 bits, stored left-aligned in 16, has counts that are multiples of 16, of at most 65520. Images of
+    less than 6 bits are drawings or thresholds, whose brightest level is not saturated.
     """
     counts = frames.to(torch.int32 if frames.dtype.itemsize < 4 else torch.int64)  # others have no bitwise operations
     largest = int(counts.max())
     step = largest & -largest  # the largest power of two that divides it
-    aligned = largest <= full_scale < largest + step and not bool((counts & (step - 1)).any())
+    aligned = 63 * step <= largest <= full_scale < largest + step and not bool((counts & (step - 1)).any())
     return largest if aligned else full_scale
 
 
