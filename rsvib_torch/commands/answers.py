@@ -87,11 +87,12 @@ def restoration_lines(result: stacks.RestoredFrames, count: int) -> list[str]:
 
 def restoration_of(run: stacks.StackReport) -> tuple[list[str], Table]:
     """What a run restored, as lines and as data, with warnings; of a single window with its verdict."""
+    stored = stacks.read_manifest(run.manifest)
     if run.windows == 1 and run.first is not None and run.first.restoration is not None:
         first = run.first.restoration
         warn_of_restoration(first)
-        return restoration_lines(first, run.first.window.last + 1), reports.restoration_data(first)
-    stored = stacks.read_manifest(run.manifest)
+        lines = restoration_lines(first, run.first.window.last + 1)
+        return lines + stored.losses, reports.restoration_data(first)
     warn_of_failures(stored)
     return [run.summary(), *stored.lines()[1][1:]], stored.totals()
 
@@ -116,11 +117,15 @@ def steps_after_detection(
         restore = ("restore", frames, frames.with_name("restored.tif"), *settings.arguments, "--vibration", vibration)
         steps.append(next_step("restore the frames", *restore))
     reasons = [reason for of_axis in result.findings for reason in of_axis]
-    if any(reason.kind.free_model for reason in reasons):
-        # a run in windows measures vibrations that change, unless the frames agree with another timing
-        if vibration is not None and not any(reason.code.startswith("other_") for reason in reasons):
-            command = ("run", frames, frames.with_name("results"), *settings.arguments)
-            steps.append(next_step("measure a vibration that changes, and restore the frames", *command))
+    run = ("run", frames, frames.with_name("results"), *settings.arguments)
+    if any(reason.code == "other_frame_times" for reason in reasons):
+        steps.append(next_step("restore the frames with the times of those after the lost one", *run))
+    # any motion explains frames with a wrong timing as well
+    elif any(reason.kind.free_model for reason in reasons) and not any(
+        one.code.startswith("other_") for one in reasons
+    ):
+        if vibration is not None:  # a run in windows measures vibrations that change
+            steps.append(next_step("measure a vibration that changes, and restore the frames", *run))
         motion = ("motion", frames, *settings.arguments, "--out", "motion.csv")
         steps.append(next_step("detect a motion that is not a steady vibration", *motion))
     if reasons:

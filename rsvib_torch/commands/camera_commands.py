@@ -17,7 +17,7 @@ from rsvib_torch.files.atomic import whole_file
 from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.cameras import camera_mode, find_cameras
 from rsvib_torch.motion.timing import SensorSection, SensorTiming
-from rsvib_torch.text import measured_text, printable, text_table
+from rsvib_torch.text import measured_text, number_of, printable, text_table
 
 if TYPE_CHECKING:
     from rsvib_torch.io.stack_info import StackInfo
@@ -100,7 +100,10 @@ def _describe_camera(path: Path, given: Table, camera: str | None) -> str:
     """Text of the configuration file: values of the command line and of the file of the frames."""
     with working(f"reading {path}"):
         info = io.read_stack_info(path)
-    size = f"{info.shape[0]} frames of {info.shape[-2]} x {info.shape[-1]} px (height x width), {info.dtype}"
+    # three or four images of a stack may be stored as the colours of one frame
+    of = f"{info.shape[1]} channels of " if info.shape[0] == 1 and len(info.shape) > 3 else ""
+    frames = f"{number_of(info.shape[0], 'frame')} of {of}{info.shape[-2]} x {info.shape[-1]} px"
+    size = f"{frames} (height x width), {info.dtype}"
     note(f"{path}: {size}")
     values, rows = dict(given), info.shape[-1 if given.get("scan_axis") == "x" else -2]
     stated = io.stated_rate(info)

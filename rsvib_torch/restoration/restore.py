@@ -9,7 +9,7 @@ from rsvib_torch.checks.arguments import ArrayLike, FramesOrFiles
 from rsvib_torch.execution.parallel import full_precision, outside_graphs, threads_for
 from rsvib_torch.frames.entry_points import TimedModule, module_options, vibration_options
 from rsvib_torch.frames.pixels import are_mosaics, enlarged, interpolated_colours
-from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
+from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames, text_of_lost_rows
 from rsvib_torch.imaging.sensor_model import Optics, sharpened
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
@@ -127,12 +127,8 @@ def restore(
         mosaic=options.mosaic,
     )
     warn_of_mosaic(prepared)
-    if prepared.lost is not None:
-        rows, frames_of = int(prepared.lost.sum()), prepared.lost.any(-1).nonzero()[:, 1].unique().tolist()
-        warn_of_restoration(
-            f"{rows} rows of frames {frames_of} have one value, but detail in other frames: they count as pixels "
-            "without data"
-        )
+    if lost := prepared.lost_rows():
+        warn_of_restoration(text_of_lost_rows(lost))
     timing = prepared.image_timing
     _, count, _, height, _ = prepared.images.shape
     vibration, left_alone = vibration_to_undo(vibration, timing, count, height)

@@ -13,6 +13,7 @@ from torch import Tensor
 from rsvib_torch.checks.arguments import PathLike
 from rsvib_torch.checks.values import check_choice
 from rsvib_torch.frames.pixels import check_mosaic, colour_frames, enlarged
+from rsvib_torch.frames.prepare import largest_count
 from rsvib_torch.io import full_scale as scales
 from rsvib_torch.io.frame_reader import FrameError, FrameReader
 from rsvib_torch.io.frame_times import exposure_times, timing_of_stack
@@ -111,7 +112,7 @@ class StackJob:
                 taken,
                 moved.timing,
                 moved.motion,
-                self.chosen,
+                self._for_counts(taken),
                 force=options.force,
                 first_frames=len(kept) if len(kept) > 1 and not self.chosen.joint else None,
                 most_pairs=8 if window.alone else 2,  # limits the time of the verdict
@@ -161,6 +162,14 @@ class StackJob:
         """Frames that were not restored, in the shape of restored ones."""
         mosaic = self.chosen.mosaic
         return enlarged(frames if mosaic is None else colour_frames(frames, mosaic), self.chosen.scale)
+
+    def _for_counts(self, frames: Tensor) -> RestorationOptions:
+        """The options of ``restore``: with the largest count of fewer bits in place of full scale."""
+        full_scale = self.options.full_scale
+        if self.chosen.saturation != 1.0 or full_scale is None:
+            return self.chosen
+        counts = (frames * full_scale).round().nan_to_num(0.0).to(torch.int64)
+        return replace(self.chosen, saturation=largest_count(counts, full_scale) / full_scale)
 
     def _images(self, frames: Sequence[Array]) -> Tensor:
         """Frames as stored as (T, H, W) or (T, C, H, W), full scale 1."""

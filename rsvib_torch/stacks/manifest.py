@@ -16,6 +16,7 @@ import numpy as np
 from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.values import fields_of
 from rsvib_torch.files.reading import Table
+from rsvib_torch.frames.prepare import text_of_lost_rows
 from rsvib_torch.io.stack_info import split_range
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.spline import FreeMotion
@@ -80,7 +81,7 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
     def summary(self) -> str:
         """Tones over the windows, what was restored, and what failed."""
         vibration, restoration = self.lines()
-        return "\n".join([*vibration, *(restoration if self.output is not None else [])])
+        return "\n".join([*vibration, *(restoration if self.output is not None else self.losses)])
 
     def table(self, *, pixel_size: float | None = None) -> dict[str, list[object]]:
         """One row per tone, axis and window, as in ``DetectedVibration.table``; a failed window has one row.
@@ -162,7 +163,7 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
         for name, notes in data["left_alone"].items() if not is_still else ():
             texts = {window: note["text"] for window, note in notes.items()}
             restoration += [wrapped(f"{name} unchanged in {text}") for text in _first_of(texts)]
-        return vibration, restoration
+        return vibration, restoration + self.losses
 
     def _tone_lines(self) -> list[str]:
         """A table of the tones of each axis over the windows, and what its columns mean.
@@ -195,10 +196,17 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
                 if record.detection is not None and record.motion is not None and record.detection.assumptions
             }
             lines += [wrapped(f"assumed in {note}") for note in _first_of(refused)]
-        lost = [f"{one.lost_before} (window {one.window})" for one in self.windows if one.lost_before is not None]
+        return lines
+
+    @property
+    def losses(self) -> list[str]:
+        """Sentences about frames and rows that were lost."""
+        lines, lost = [], [f"{one.lost_before} (window {one.window})" for one in self.windows if one.lost_before]
         if lost:
             text = "of their windows are taken a frame period later; state the times of all frames if they are known"
             lines.append(wrapped(f"a frame is lost before frame {', '.join(lost)}: the later frames {text}"))
+        if rows := {int(index): count for one in self.windows for index, count in one.lost_rows.items()}:
+            lines.append(wrapped(text_of_lost_rows(rows)))
         return lines
 
     def _lines_of_video(self) -> list[str]:

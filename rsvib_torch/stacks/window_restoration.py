@@ -6,7 +6,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import math
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -195,6 +195,7 @@ class RestoredFrames:
     verdict: RestorationVerdict | None  # whether restoration helps; None if frames could not be compared
     moves: bool  # whether there was a vibration to remove
     axes: int = 2  # number of components of the motion: 2, 3 with roll, 4 with roll and zoom
+    lost_rows: Mapping[int, int] = field(default_factory=dict)  # number for each of the frames that has some
 
     def restored_axes(self) -> list[str]:
         """Names of the axes that were restored."""
@@ -226,8 +227,10 @@ def restore_trusted(
     frames = frames if first_frames is None else frames[:first_frames]
     joint, scale, optics = options.joint, options.scale, check_optics(options.optics)
     prepared = prepare_frames(frames, timing, saturation=options.saturation, mosaic=options.mosaic)
+    lost = prepared.lost_rows()
     if not bool(vibration.moving_axes().any()):
-        return RestoredFrames(unchanged_frames(prepared, joint, scale), False, left_alone, None, False)
+        as_taken = unchanged_frames(prepared, joint, scale)
+        return RestoredFrames(as_taken, False, left_alone, None, False, lost_rows=lost)
     warn_of_mosaic(prepared)
     restored = restore_prepared(prepared, vibration, options)
     verdict = None
@@ -238,7 +241,7 @@ def restore_trusted(
     if keep:
         restored = sharpened(restored, optics, scale)
     result = prepared.from_row_order(restored) if keep else unchanged_frames(prepared, joint, scale)
-    return RestoredFrames(result, keep, left_alone, verdict, True, vibration.num_axes)
+    return RestoredFrames(result, keep, left_alone, verdict, True, vibration.num_axes, lost)
 
 
 def without_data(frames: Tensor, taken: Tensor) -> Tensor:

@@ -127,12 +127,15 @@ class WindowRecord:
     shaking: dict[str, tuple[float, ...]] | None = None
     motion: FreeMotion | None = None  # of a window in which the vibration changes, in place of tones; as the detection
     lost_before: int | None = None  # frame of the stack before which one is lost: from it on, a frame period later
+    lost_rows: dict[str, int] = field(default_factory=dict)  # number for each frame of the stack that has some
 
     @classmethod
     def of(cls, result: WindowResult, timing: SensorTiming, written: int) -> "WindowRecord":
         """The record of a result of which ``written`` frames were written; ``timing`` is that of the whole stack."""
         window, restoration = result.window, result.restoration
         verdict = None if restoration is None else restoration.verdict
+        usable = [index for index in window.written if index not in result.bad_frames]
+        lost = {} if restoration is None else restoration.lost_rows
         return cls(
             window=window.index,
             first=window.first,
@@ -148,6 +151,7 @@ class WindowRecord:
             error=result.error,
             motion=None if result.motion is None else result.motion.to("cpu"),
             lost_before=result.lost_before,
+            lost_rows={str(index): lost[place] for place, index in enumerate(usable) if place in lost},
         )
 
 

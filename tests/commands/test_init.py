@@ -131,3 +131,10 @@ def test_typical_mistakes_are_warned_of(place, frames, capsys, row_time, message
     write_stack("f.npy", frames)
     assert init("f.npy", "--row-time", row_time, "--exposure", "1ms", *RATE) == 0
     assert message in capsys.readouterr().err
+
+
+def test_images_that_are_stored_as_colours_of_one_frame_are_named(place, frames, capsys):
+    counts = (4095 * frames[:3].numpy()).astype(np.uint16)
+    tifffile.imwrite("frames.tif", counts, photometric="rgb", planarconfig="separate")
+    assert init("frames.tif", *TIMES, *RATE, "--full-scale", 4095) == 0
+    assert "1 frame of 3 channels of 64 x 48 px" in capsys.readouterr().out

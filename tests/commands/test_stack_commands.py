@@ -148,3 +148,16 @@ def test_raw_frames_behind_colour_filters_on_a_finer_grid(tmp_path):
     assert np.sqrt(np.mean((written - STILL)[:, 12:-12, 12:-12] ** 2)) < 0.06
     assert (out / "before_after.png").exists()
     assert "which have 2 x 2 points per px" in (out / "report.html").read_text()
+
+
+def test_saturation_of_left_aligned_counts_in_a_run(place, tmp_path):
+    """12 bits in 16: pixels of the count 65520 are saturated, although full scale is 65535."""
+    frames = (tifffile.imread(place / "frames.tif")[:5].astype(int) * 2).clip(0, 4095) << 4
+    assert (frames == 65520).mean() > 0.001
+    tifffile.imwrite(tmp_path / "left.tif", frames.astype("uint16"), photometric="minisblack")
+    for name, options in (("auto", ()), ("stated", ("--saturation", 65520))):
+        arguments = (tmp_path / "left.tif", tmp_path / name, "--config", place / "camera.toml", "--full-scale", 65535)
+        assert rsvib("run", *arguments, *options, "--method", "exact") == 0
+    found, expected = (tifffile.imread(tmp_path / name / "restored.tif") for name in ("auto", "stated"))
+    assert found.max() > 60000
+    np.testing.assert_array_equal(found, expected)

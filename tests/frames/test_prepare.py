@@ -66,10 +66,11 @@ def test_masks_follow_the_frames():
 
 
 @pytest.mark.parametrize(
-    ("bits", "largest", "saturated"), [(12, 4095, True), (12, 4094, False), (10, 1023, True), (16, 65520, False)]
+    ("bits", "largest", "saturated"),
+    [(12, 4095, True), (12, 4094, False), (10, 1023, True), (16, 65520, False), (4, 15, False)],
 )
 def test_saturation_of_fewer_bits_stored_left_aligned(bits, largest, saturated):
-    """A camera of 12 bits in files of 16 bits has at most the count 65520."""
+    """A camera of 12 bits in files of 16 bits has at most the count 65520; a drawing of 16 levels is not saturated."""
     counts = np.random.default_rng(0).integers(0, largest - 2, (2, 8, 8))
     counts[:, 0, 0], counts[:, 0, 1] = largest, largest // 2
     stored = (counts << (16 - bits)).astype(np.uint16)

@@ -46,7 +46,7 @@ def test_rows_that_were_lost_count_as_missing():
     frames[2, 100:160] = 0.0
     detection = detect_vibration(frames, timing)
     assert detection.reliable.all()
-    with pytest.warns(RestorationWarning, match=r"60 rows of frames \[2\]"):
+    with pytest.warns(RestorationWarning, match=r"one value in frame 2 \(60 in all\)"):
         restored = restore(frames, timing, detection)
     recorded = np.r_[0:90, 170 : frames.shape[1]]
     for frame, rows in ((0, slice(None)), (1, slice(None)), (2, recorded), (3, slice(None))):
@@ -61,6 +61,20 @@ def test_rows_without_detail_in_all_frames_are_measured():
     frames[0, 10, 50] = 0.1
     frames[1] = 0.0
     assert prepare_frames(frames, camera()).missing is None
+
+
+def test_rows_of_one_value_that_the_scene_has_were_not_lost():
+    """A saturated sky, a clipped road and the black sky between stars move from frame to frame."""
+    moved, lines = Motion((1.6, 4.0), (71.0, 97.0), (0.4, 2.0)), np.arange(SCENE.shape[0])[:, None]
+    stars = np.where(np.random.default_rng(2).random(SCENE.shape) > 0.998, 1.0, -0.1)
+    for scene in (
+        np.where(lines < 110, 1.3, SCENE),
+        np.where(abs(lines - 140) < 8, -0.3, SCENE),
+        stars,
+    ):
+        frames = torch.from_numpy(take_frames(scene, camera(), moved, 5)).clamp(0, 1)
+        assert int((frames.amax(-1) == frames.amin(-1)).sum(-1).unique().numel()) > 1
+        assert prepare_frames(frames, camera()).lost is None
 
 
 def test_frame_without_data_does_not_affect_joint_restoration():

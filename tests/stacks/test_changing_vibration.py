@@ -222,3 +222,25 @@ def test_frames_after_a_lost_one_are_taken_a_frame_period_later(tmp_path):
     assert "a frame is lost before frame 11 (window 1)" in manifest.summary()
     assert [given is None for given in manifest.detections()] == [False, True, False]
     assert min(decibel(frame, STILL) for frame in np.load(tmp_path / "out.npy")) > 37
+
+
+def test_commands_name_lost_frames_and_rows(tmp_path, capsys):
+    """A run of few frames and ``rsvib restore`` name them as a run in windows does; only a run restores all frames."""
+    frames = np.delete(take_frames(SCENE, TIMING, Curve(steady), 7, noise=0.003), 3, axis=0).astype(np.float32)
+    frames[1, 60:100] = 0
+    np.save(tmp_path / "frames.npy", frames)
+    assert rsvib("run", tmp_path / "frames.npy", tmp_path / "out", *CAMERA) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    lost = "rows of one value in frame 1 (40 in all)"
+    assert "a frame is lost before frame 3" in shown
+    assert lost in shown
+    assert rsvib("detect", tmp_path / "frames.npy", "--out", tmp_path / "found", *CAMERA) == 0
+    shown = capsys.readouterr().out
+    assert "rsvib run" in shown
+    assert "rsvib motion" not in shown[shown.index("Next") :]
+    np.save(tmp_path / "before.npy", frames[:3])
+    vibration = tmp_path / "out" / "vibration.json"
+    options = ("--vibration", vibration, *CAMERA)
+    assert rsvib("restore", tmp_path / "before.npy", tmp_path / "restored.npy", *options) == 0
+    assert lost in " ".join(capsys.readouterr().out.split())
+    assert read_manifest(tmp_path / "restored.npy.manifest.json").windows[0].lost_rows == {"1": 40}
