@@ -25,37 +25,22 @@ from rsvib_torch.numerics.interpolation import extend_rows, fast_length
 _MARGIN = 16  # px over which the scene closes to a period; 8 and 32 px change these bounds by less than 3e-5
 
 BoundMethod = Literal["gradients", "random"]
-# axis, name of the field, tone
-_Parameter = tuple[int, str, int]
 
 
 # --- Information ---
 
 
-def _parameters(motion: Vibration, acceleration: bool) -> list[_Parameter]:
-    """Unknown parameters: those of all tones of non-zero amplitude, and the image motion of all axes."""
-    parameters: list[_Parameter] = []
-    for axis in range(motion.num_axes):
-        for tone in range(motion.amplitude.shape[-1]):
-            if float(motion.amplitude[axis, tone]) > 0:
-                parameters += [(axis, name, tone) for name in ("amplitude", "frequency", "phase")]
-        parameters += [(axis, "image_motion", 0)]
-        parameters += [(axis, "image_acceleration", 0)] if acceleration else []
-    return parameters
+def _sensitivity(motion: Vibration, times: Tensor) -> Tensor:
+    """Derivatives (A, 3 K + 2, ...) of the components of the motion at ``times`` (...) by all of its parameters.
 
-
-def _sensitivity(motion: Vibration, parameter: _Parameter, times: Tensor) -> Tensor:
-    """Derivative of a component of the motion at ``times`` by a parameter."""
-    axis, name, tone = parameter
-    if name == "image_motion":
-        return times
-    if name == "image_acceleration":
-        return 0.5 * times.square()
-    amplitude, frequency, phase = (value[axis, tone] for value in (motion.amplitude, motion.frequency, motion.phase))
+    Those are the amplitudes, frequencies and phases of the tones, image motion and image acceleration.
+    """
+    shape = (*motion.amplitude.shape, *(1,) * times.ndim)
+    amplitude, frequency, phase = (one.view(shape) for one in (motion.amplitude, motion.frequency, motion.phase))
     angle = 2 * math.pi * frequency * times + phase
-    if name == "amplitude":
-        return angle.sin()
-    return amplitude * angle.cos() * (2 * math.pi * times if name == "frequency" else 1.0)
+    by_phase = amplitude * angle.cos()
+    polynomial = torch.stack([times, 0.5 * times.square()]).expand(len(amplitude), 2, *times.shape)
+    return torch.cat([angle.sin(), by_phase * 2 * math.pi * times, by_phase, polynomial], 1)
 
 
 def _information(
@@ -64,10 +49,12 @@ def _information(
     num_frames: int,
     timing: RowTiming,
     motion: Vibration,
-    parameters: list[_Parameter],
+    unknown: Tensor,
     noise: float | None,
 ) -> tuple[Tensor, Tensor]:
     """Information (P, P) of the parameters row by row, for unit noise, and approximately (P,) for a known scene.
+
+    ``unknown`` marks the parameters among those of ``_sensitivity``.
 
     ``J = sum_s sum_p (d_p - d)' M(s) (d_p - d)``: M(s) sums the gradient products of row s of the scene (Hs, Ws), d_p
     are the derivatives of its displacement in frame p and d their mean. Blur within the exposure and the extent of
@@ -78,11 +65,11 @@ def _information(
     (height, width), device = size, scene.device
     top, left = ((whole - part) // 2 for whole, part in zip(scene.shape, size, strict=True))
     y, x = (torch.arange(count, dtype=torch.float64, device=device) for count in scene.shape)
-    axes = [axis for axis, _, _ in parameters]
+    axes = unknown.nonzero()[:, 0]
 
     def sensitivity(times: Tensor) -> Tensor:
         """From times (...) to the derivatives (P, ...) of the component that each parameter changes."""
-        return torch.stack([_sensitivity(motion, parameter, times) for parameter in parameters])
+        return _sensitivity(motion, times)[unknown]
 
     # rows (S, T) of the frames that show each row of the scene, and how many of them per row of the scene
     moved = _of_middle_column(motion, timing, num_frames, height)
@@ -97,12 +84,12 @@ def _information(
     low, high = (torch.where(seen > 0, shift, far) for far in (math.inf, -math.inf))
     window = (x - left >= -low.amin(1, keepdim=True)) & (x - left <= width - 1 - high.amax(1, keepdim=True))
     from_centre = (x - left - 0.5 * (width - 1))[None], (y - top - 0.5 * (height - 1))[:, None]
-    factors = displacement_factors(*from_centre, max(axes) + 1)  # (Hs, Ws, 2, A)
+    factors = displacement_factors(*from_centre, motion.num_axes)  # (Hs, Ws, 2, A)
     products = _gradient_products(scene, factors, window.double(), noise, num_frames)  # (S, A, A)
 
     # derivatives (P, S, T, A) of the displacement by the parameters, averaged over the exposures, without their mean
     times, weights = (value.to(device) for value in exposure_nodes(timing, "gauss", 8))
-    of_axis = functional.one_hot(torch.tensor(axes, device="cpu"), factors.shape[-1]).to(weights)
+    of_axis = functional.one_hot(axes, factors.shape[-1]).to(weights)
     derivatives = (sensitivity(moments[..., None] + times) @ weights)[..., None] * of_axis[:, None, None]
     mean = (seen[..., None] * derivatives).sum(2, keepdim=True) / seen.sum(1).clamp(min=1e-300)[:, None, None]
     relative = derivatives - mean
@@ -223,17 +210,16 @@ def cramer_rao_bound(
     frames = simulate_frames(scene.double(), timing, vibration, num_frames, frame_size=frame_size)
     size = frames_to_row_order(frames, timing).shape[-2:]
     motion = vibration.to_row_order(timing).to(scene.device)
-    parameters = _parameters(motion, acceleration)
+    # the parameters of the tones of an amplitude above 0, and the image motion
+    others = torch.tensor([True, acceleration], device=scene.device).expand(motion.num_axes, 2)
+    unknown = torch.cat([(motion.amplitude > 0).repeat(1, 3), others], 1)
     still = frames_to_row_order(scene.double(), timing)
     level = noise if method == "random" else None
     information, typical = _information(
-        still, (size[0], size[1]), num_frames, timing.in_row_order(), motion, parameters, level
+        still, (size[0], size[1]), num_frames, timing.in_row_order(), motion, unknown, level
     )
-    deviations = noise * _deviations(information, typical)
-
-    std = {name: torch.zeros_like(motion.amplitude) for name in ("amplitude", "frequency", "phase")}
-    std |= {name: torch.zeros_like(motion.image_motion) for name in ("image_motion", "image_acceleration")}
-    for (axis, name, tone), deviation in zip(parameters, deviations, strict=True):
-        std[name][(axis, tone) if std[name].ndim == 2 else axis] = deviation
-    std["period"] = std["frequency"] / torch.where(motion.frequency > 0, motion.frequency, 1.0).square()
-    return VibrationStd(**std).from_row_order(timing)
+    deviations = torch.zeros(unknown.shape, dtype=torch.float64, device=scene.device)
+    deviations[unknown] = noise * _deviations(information, typical)
+    amplitude, frequency, phase, others = deviations.split([*3 * [motion.amplitude.shape[1]], 2], 1)
+    period = frequency / torch.where(motion.frequency > 0, motion.frequency, 1.0).square()
+    return VibrationStd(amplitude, frequency, period, phase, *others.unbind(1)).from_row_order(timing)

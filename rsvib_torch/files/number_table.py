@@ -3,9 +3,8 @@
 import csv
 import math
 from array import array
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,15 +12,6 @@ from numpy.typing import NDArray
 from rsvib_torch.text import one_line, quoted
 
 MAX_SAMPLES = 10**7  # rows of a table of numbers; 80 minutes of a gyroscope with 2 kHz
-_MAX_LINE = 2**16  # characters of a line; a line without end is not read as a whole
-
-
-def text_lines(path: Path, file: IO[str]) -> Iterator[str]:
-    """Lines of a text file, of bounded length."""
-    while line := file.readline(_MAX_LINE):
-        if len(line) == _MAX_LINE:
-            raise ValueError(f"{path}: a line of more than {_MAX_LINE} characters; expected rows of numbers")
-        yield line
 
 
 def rows_of_numbers(

@@ -15,7 +15,7 @@ import torch
 
 from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.values import check_number
-from rsvib_torch.files.number_table import rows_of_numbers, text_lines
+from rsvib_torch.files.number_table import rows_of_numbers
 from rsvib_torch.files.reading import check_regular
 from rsvib_torch.gyroscope.gpmf_track import is_mp4, read_gpmf
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, orientation_matrix
@@ -35,11 +35,10 @@ _MAX_HEADER = 1000  # lines
 def _read_table(path: Path, is_log: bool) -> tuple[Array, Array, str, str]:
     """As ``read_gpmf``, of a CSV file with units, or of a gyroflow log, whose header states factors and axes."""
     with path.open(newline="", encoding="utf-8-sig") as file:
-        lines = text_lines(path, file)
-        header, count = _header(path, lines) if is_log else ({}, 0)
-        names = [name.strip().lower() for name in (header["t"] if is_log else next(csv.reader(lines), []))]
+        header, count = _header(path, file) if is_log else ({}, 0)
+        names = [name.strip().lower() for name in (header["t"] if is_log else next(csv.reader(file), []))]
         columns, units = _columns(path, names)
-        table = rows_of_numbers(path, lines, names, columns, count + 2)
+        table = rows_of_numbers(path, file, names, columns, count + 2)
     times, rates = table[:, 0], table[:, 1:]
     if is_log:
         axes = header.get("orientation", ["", "XYZ"])[1]

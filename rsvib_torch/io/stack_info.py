@@ -149,11 +149,9 @@ class StackInfo(Summarised):
         metadata = self.metadata
         if shape[-2:] != self.shape[-2:]:
             metadata = {name: None if tag is None or tag.scope == "image" else tag for name, tag in metadata.items()}
-        if shape[0] != self.shape[0]:
-            return replace(
-                self, shape=shape, metadata=metadata, frame_times=None, frame_numbers=None, path=None, files=None
-            )
-        return replace(self, shape=shape, metadata=metadata)
+        same = shape[0] == self.shape[0]
+        of_frames: Table = {} if same else dict.fromkeys(("frame_times", "frame_numbers", "path", "files"))
+        return replace(self, shape=shape, metadata=metadata, **of_frames)
 
     def with_frames(self, count: int) -> "StackInfo":
         """The same kind of stack with ``count`` frames."""

@@ -120,11 +120,6 @@ class Camera:
         return replace(self, focal_length=factor * self.focal_length, principal_point=(factor * x, factor * y))
 
     @property
-    def distorts(self) -> bool:
-        """Whether positions in the image are not in proportion to (u, v)."""
-        return self.fisheye or any(self.distortion)
-
-    @property
     def _tangential(self) -> tuple[float, float]:
         """(p1, p2)."""
         return (0.0, 0.0) if self.fisheye else (self.distortion[2], self.distortion[3])
@@ -179,7 +174,7 @@ class Camera:
         check_broadcast(x=x, y=y)
         x, y = torch.broadcast_tensors(1.0 * x, 1.0 * y)
         along, across = ((p - c) / self.focal_length for p, c in zip((x, y), self.principal_point, strict=True))
-        if not self.distorts:
+        if not self.fisheye and not any(self.distortion):
             return along, across
         if self.fisheye:
             distance = torch.hypot(along, across)

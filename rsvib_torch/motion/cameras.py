@@ -9,6 +9,8 @@ from dataclasses import replace
 from functools import cache
 from importlib.resources import files
 
+from pydantic import TypeAdapter
+
 from rsvib_torch.checks.values import check_number, check_whole_number, described, options
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.text import measured_text, number_of, quoted
@@ -104,24 +106,9 @@ class CameraMode:
 def _modes() -> tuple[CameraMode, ...]:
     """All modes of the table, in the order of brand, model, and size."""
     text = (files("rsvib_torch") / "motion" / "readout_times.csv").read_text(encoding="utf-8")
-    lines = csv.reader(line for line in text.splitlines() if not line.startswith("#"))
-    next(lines)  # names of the columns
-    return tuple(
-        CameraMode(
-            brand=brand,
-            model=model,
-            lens=lens,
-            width=int(width),
-            height=int(height),
-            frame_rate=float(rate),
-            readout_time=1e-3 * float(readout_ms),
-            readout_time_std=1e-3 * float(spread_ms),
-            calibrations=int(entries),
-            readout_direction=direction,
-            measured_rows=int(height),
-        )
-        for brand, model, lens, width, height, rate, readout_ms, spread_ms, entries, direction in lines
-    )
+    lines = csv.DictReader(line for line in text.splitlines() if not line.startswith("#"))
+    mode = TypeAdapter(CameraMode)
+    return tuple(mode.validate_strings({**line, "measured_rows": line["height"]}) for line in lines)
 
 
 def _letters(text: str) -> str:

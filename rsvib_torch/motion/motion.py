@@ -7,7 +7,6 @@ In one column, the displacement by a motion with roll, zoom or a camera depends 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass
 from typing import Self
 
@@ -37,11 +36,6 @@ class Motion(Result, ABC):
     row 0 of frame 0; results (S, axes) are float64, and differentiable except for bounds. A motion is an immutable
     value.
     """
-
-    @property
-    @abstractmethod
-    def batch_shape(self) -> torch.Size:
-        """Leading dimensions: empty for one motion, (B,) for a batch of stacks."""
 
     @property
     def device(self) -> torch.device:
@@ -170,9 +164,7 @@ class Motion(Result, ABC):
 
     def with_camera(self, camera: Camera | None) -> Self:
         """The same components with another camera."""
-        result = copy(self)
-        object.__setattr__(result, "camera", camera)
-        return result
+        return self._changed(camera=camera)
 
     def detached(self) -> Self:
         """The same motion without gradients."""
@@ -183,15 +175,9 @@ class Motion(Result, ABC):
         check_whole_number("size", size, at_least=1, at_most=MAX_BATCH)
         return self.mapped(lambda values: values.expand(size, *values.shape))
 
-    def __getitem__(self, index: int) -> Self:
-        """One motion of a batch."""
-        if not self.batch_shape:
-            raise IndexError("this motion is not a batch")
-        return self.mapped(lambda values: values[index])
-
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ColumnMotion(Motion):
+class ColumnMotion(Motion, shapes={"column": "..."}):
     """Displacement (x, y) in px of the content of single columns, by a motion with roll or zoom, in row order.
 
     The displacement at time t is that of the row that is being exposed at that time: a row belongs to the frame that

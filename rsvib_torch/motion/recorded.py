@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.values import check_number
-from rsvib_torch.files.number_table import rows_of_numbers, text_lines
+from rsvib_torch.files.number_table import rows_of_numbers
 from rsvib_torch.files.reading import check_regular
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.options import MotionUnit
@@ -84,14 +84,13 @@ def _table(path: Path) -> tuple[Array, Array]:
     check_regular(path)
     with path.open(newline="", encoding="utf-8-sig") as file:
         try:
-            lines = text_lines(path, file)
-            head = next(csv.reader(lines, skipinitialspace=True), [])
+            head = next(csv.reader(file, skipinitialspace=True), [])
             names = [name.partition("(")[0].strip().lower() for name in head]  # without units
             missing = [name for name in _COLUMNS if name not in names]
             if missing:
                 present = ", ".join(names) or "nothing"
                 raise ValueError(f"{path}: column {missing[0]!r} is missing; the first line has {one_line(present)}")
-            table = rows_of_numbers(path, lines, names, [names.index(name) for name in _COLUMNS], 2)
+            table = rows_of_numbers(path, file, names, [names.index(name) for name in _COLUMNS], 2)
         except (UnicodeDecodeError, csv.Error) as error:
             raise ValueError(f"{path}: not a CSV file: {error}") from error
     if len(table) < _LEAST_SAMPLES:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 import numpy as np
@@ -26,7 +26,9 @@ MAX_EXPOSURE_NODES = 10_000  # times; an exposure of 1 s of a gyroscope with 5 k
 
 @dataclass(frozen=True, eq=False, repr=False)
 @checked_methods
-class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "s"}):
+class FreeMotion(
+    Motion, units={"coefficients": "px", "start": "s", "spacing": "s"}, shapes={"coefficients": "... A N"}
+):
     """A free spline with tones: ``D(t) = sum_k A_k sin(2 pi f_k t + phi_k) + v t + a t^2 / 2 + R(t)``.
 
     ``R(t) = sum_n c_n B((t - start) / spacing - n + 1)`` is a cubic B-spline; before its first and after its last knot
@@ -88,8 +90,7 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         start = check_number("start", start, at_least=-MAX_START_TIME, at_most=MAX_START_TIME)
         spacing = check_number("spacing", spacing, at_least=MIN_ROW_TIME)
         camera = tones.camera if camera is None else camera
-        for field, value in zip(fields(self), (values, start, spacing, tones, camera), strict=True):
-            object.__setattr__(self, field.name, value)
+        vars(self).update(coefficients=values, start=start, spacing=spacing, tones=tones, camera=camera)
 
     @classmethod
     def through(
@@ -180,11 +181,6 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         first = f"{self.start:.6g} … {self.end:.6g} s, {count} knots {1e3 * self.spacing:.4g} ms apart"
         tones = [self.tones.summary()] if bool(self.tones.moving_axes().any()) else []
         return "\n".join([first, text_table(head, rows), *tones])
-
-    @property
-    def batch_shape(self) -> torch.Size:
-        """Leading dimensions: empty for one motion, (B,) for a batch of stacks."""
-        return self.coefficients.shape[:-2]
 
     @property
     def end(self) -> float:

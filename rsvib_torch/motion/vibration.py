@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass, field, replace
 from typing import Self
 
@@ -177,9 +176,7 @@ class Vibration(
             order = tones[0].detach().argsort(dim=-1, descending=True, stable=True)
             tones = [tensor.take_along_dim(order, dim=-1) for tensor in tones]
         polynomial = [values.expand(*batch, axes) for values in polynomial]
-        for name, tensor in zip(_LIMITS, (*tones, *polynomial), strict=True):
-            object.__setattr__(self, name, tensor)
-        object.__setattr__(self, "camera", camera)
+        vars(self).update(zip(_LIMITS, (*tones, *polynomial), strict=True), camera=camera)
 
     @classmethod
     def still(cls, batch_shape: Sequence[int] = (), device: torch.device | str | None = None, *, axes: int = 2) -> Self:
@@ -200,24 +197,14 @@ class Vibration(
         """
         tones = (parameters.shape[-1] - 3) // 3
         *of_tones, polynomial = parameters.split([tones, tones, tones, 3], -1)
-        vibration = cls.__new__(cls)
-        for name, values in zip(_LIMITS, (*of_tones, *polynomial.unbind(-1)), strict=True):
-            object.__setattr__(vibration, name, values)
-        object.__setattr__(vibration, "camera", None)
-        return vibration
+        values = dict(zip(_LIMITS, (*of_tones, *polynomial.unbind(-1)), strict=True))
+        return cls.__new__(cls)._changed(**values, camera=None)
 
     @property
     def parameters(self) -> Tensor:
         """All values as one tensor (..., A, 3 K + 3), as in ``from_parameters``."""
         polynomial = torch.stack([getattr(self, name) for name in _POLYNOMIAL], -1)
         return torch.cat([self.amplitude, self.frequency, self.phase, polynomial], -1)
-
-    def _changed(self, **values: Tensor | Camera | None) -> Self:
-        """The vibration with some values replaced, without checks."""
-        changed = copy(self)
-        for name, value in values.items():
-            object.__setattr__(changed, name, value)
-        return changed
 
     @classmethod
     def stacked(cls, vibrations: Sequence["Vibration"]) -> "Vibration":
@@ -265,11 +252,6 @@ class Vibration(
         """The tones of each axis as a table."""
         table = text_table([*axis_head(self.batch_shape), *tone_head(self.num_axes)], tone_rows(self))
         return "\n".join([table, *image_motion_line(self)])
-
-    @property
-    def batch_shape(self) -> torch.Size:
-        """Leading dimensions: empty for one vibration, (B,) for a batch of stacks."""
-        return self.amplitude.shape[:-2]
 
     @property
     def num_axes(self) -> int:

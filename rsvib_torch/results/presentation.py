@@ -10,7 +10,7 @@ import itertools
 import math
 import os
 import types
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
@@ -129,19 +129,14 @@ def verdict_table(
     """A table with rows that begin as in ``axis_rows``, and the verdict: lines with reasons, or a column in a batch."""
     head = [*axis_head(batch_shape), *head]
     if not batch_shape:
-        return [text_table(head, rows), *verdict_lines(reliable, reasons)]
+        lines = [text_table(head, rows)]
+        for name, good, why in zip(AXIS_NAMES, reliable, reasons, strict=False):
+            lines.append(f"{name}: reliable" if bool(good) else f"{name}: not reliable:")
+            lines += [wrapped(f" - {reason}") for reason in why]
+        return lines
     good = {tuple(labels): bool(reliable[at]) for at, labels in axis_rows(batch_shape, reliable.shape[-1])}
     verdicts = ["reliable" if good[tuple(row[:2])] else "not reliable" for row in rows]
     return [text_table([*head, "verdict"], [[*row, text] for row, text in zip(rows, verdicts, strict=True)])]
-
-
-def verdict_lines(reliable: Iterable[object], reasons: Sequence[Sequence[str]]) -> list[str]:
-    """Whether each axis (x, y, roll, zoom) is reliable, with the reasons."""
-    lines = []
-    for name, good, why in zip(AXIS_NAMES, reliable, reasons, strict=False):
-        lines.append(f"{name}: reliable" if bool(good) else f"{name}: not reliable:")
-        lines += [wrapped(f" - {reason}") for reason in why]
-    return lines
 
 
 # Dictionaries
@@ -256,14 +251,20 @@ class Result(Summarised):
         shown = {name: f"tensor {tuple(v.shape)}" if isinstance(v, Tensor) else str(v) for name, v in values.items()}
         return "\n".join([type(self).__name__, *(f"  {name}: {text}" for name, text in shown.items())])
 
+    def _changed(self, **values: object) -> Self:
+        """The result with some values replaced, without checks."""
+        result = copy(self)
+        vars(result).update(values)
+        return result
+
     @property
-    def batch_shape(self) -> Sequence[int]:
+    def batch_shape(self) -> torch.Size:
         """Leading dimensions: empty for one result, (B,) for a batch of stacks."""
         for name, stated in self.shapes.items():
             value = getattr(self, name)
             if stated.startswith("... ") and isinstance(value, Tensor):
                 return value.shape[: value.ndim + 1 - len(stated.split())]
-        return ()
+        return torch.Size()
 
     def _fields_of_batch(self) -> Table:
         """Fields that have one entry for each result of a batch, by the leading dimensions that their shapes state."""
@@ -278,31 +279,28 @@ class Result(Summarised):
         """One result of a batch."""
         if not self.batch_shape:
             raise IndexError(f"this {type(self).__name__} is not a batch")
-        result = copy(self)
+        selected: Table = {}
         for name, value in self._fields_of_batch().items():
-            if isinstance(value, Tensor) and value.ndim < len(self.shapes[name].split()):
-                continue  # all results have it in common
-            selected = {k: v[index] for k, v in value.items()} if isinstance(value, dict) else value[index]
-            object.__setattr__(result, name, selected)
-        return result
+            if not isinstance(value, Tensor) or value.ndim >= len(self.shapes[name].split()):  # others are common
+                selected[name] = {k: v[index] for k, v in value.items()} if isinstance(value, dict) else value[index]
+        return self._changed(**selected)
 
     @classmethod
     def stacked(cls, results: Sequence[Self]) -> Self:
         """Results of the same shape as a batch; the new dimension is the first. Other values are those of the first."""
         if not isinstance(results, (list, tuple)) or not results or not all(isinstance(one, cls) for one in results):
             raise TypeError(f"results must be a list of {cls.__name__}, at least one, got {described(results)}")
-        result: Self = copy(results[0])
-        for name, first in result._fields_of_batch().items():
-            values = [getattr(one, name) for one in results]
-            joined: object = tuple(values)
+
+        def joined(values: Sequence[Any]) -> object:
+            first = values[0]
+            if isinstance(first, dict):
+                return {key: joined([value[key] for value in values]) for key in first}
             if isinstance(first, Tensor):
-                joined = torch.stack(values)
-            elif isinstance(first, Result):
-                joined = type(first).stacked(values)
-            elif isinstance(first, dict):
-                joined = {key: torch.stack([value[key] for value in values]) for key in first}
-            object.__setattr__(result, name, joined)
-        return result
+                return torch.stack(values)  # type: ignore[arg-type]
+            return type(first).stacked(values) if isinstance(first, Result) else tuple(values)
+
+        first: Self = results[0]
+        return first._changed(**{n: joined([getattr(one, n) for one in results]) for n in first._fields_of_batch()})
 
     def to_dict(self) -> Table:
         """All values as nested lists, numbers and texts, which JSON can store; None for numbers that are not finite."""
@@ -344,16 +342,15 @@ class Result(Summarised):
 
         Values are not checked again, so that no device is synchronised.
         """
-        result = copy(self)
-        for name, value in vars(self).items():
+
+        def changed(value: Any) -> Any:
+            if isinstance(value, dict):
+                return {key: changed(one) for key, one in value.items()}
             if isinstance(value, Tensor):
-                object.__setattr__(result, name, function(value))
-            elif isinstance(value, Result):
-                object.__setattr__(result, name, value.mapped(function))
-            elif isinstance(value, dict):
-                changed = {key: function(one) if isinstance(one, Tensor) else one for key, one in value.items()}
-                object.__setattr__(result, name, changed)
-        return result
+                return function(value)
+            return value.mapped(function) if isinstance(value, Result) else value
+
+        return self._changed(**{name: changed(value) for name, value in vars(self).items()})
 
     def to(self, device: torch.device | str) -> Self:
         """The same result with its tensors on another device."""

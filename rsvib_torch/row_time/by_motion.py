@@ -120,10 +120,10 @@ def calibrate_row_time_by_motion(frames: FramesOrFiles, options: RowTimeOptions)
             "whole of the frame period; pass row_time=(low, high) for other ones"
         )
     if num_frames < _MIN_FRAMES:
-        found = _undetermined(Reason("too_few_frames_for_row_time", None, num_frames, _MIN_FRAMES))
+        found = RowTimeFit(findings=(Reason("too_few_frames_for_row_time", None, num_frames, _MIN_FRAMES),))
     else:
         with threads_for(stack.images):
-            found = row_time_of_tones(stack, clock, options) or _undetermined(Reason("no_motion_for_row_time"))
+            found = row_time_of_tones(stack, clock, options) or RowTimeFit(findings=(Reason("no_motion_for_row_time"),))
             by_path = row_time_of_path(stack, clock) if found.findings else None
             if by_path is not None:
                 found = by_path
@@ -145,10 +145,6 @@ def _limits(row_time: tuple[float, float] | None, period: float, num_rows: int) 
             f"row times are in seconds, and at most {longest:.4g}"
         )
     return low, min(high, longest)
-
-
-def _undetermined(reason: Reason) -> RowTimeFit:
-    return RowTimeFit(math.nan, math.nan, findings=(reason,))
 
 
 def _result(found: RowTimeFit, clock: CameraClock, notes: list[str]) -> RowTimeCalibration:

@@ -66,8 +66,8 @@ class Candidate:
 class RowTimeFit:
     """Row time of the frames of one stack."""
 
-    row_time: float  # seconds, negative for a reverse readout
-    std: float  # its standard deviation
+    row_time: float = math.nan  # seconds, negative for a reverse readout; NaN if it is not determined
+    std: float = math.nan  # its standard deviation
     others: tuple[Candidate, ...] = ()  # other row times that explain the frames as well
     findings: tuple[Reason, ...] = ()  # reasons why the row time is not certain
     # largest standard deviation over the row time of a certain result; frequencies have the same relative error

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 
 from rsvib_torch.checks.arguments import Channels, FramesOrFiles, checks_arguments
-from rsvib_torch.checks.values import Positive, check_number
+from rsvib_torch.checks.values import Positive
 from rsvib_torch.results.presentation import JudgedResult
 from rsvib_torch.results.reason import Reason
 from rsvib_torch.row_time.flicker import MIN_PERIODS, find_bands, row_profiles
@@ -40,7 +40,7 @@ class RowTimeCalibration(
         findings: Each ``Reason`` why not; ``reasons`` has their texts.
     """
 
-    row_time: float | None
+    row_time: Positive | None
     row_time_std: float | None
     period_rows: float | None = None
     contrast: float | None = None
@@ -51,11 +51,6 @@ class RowTimeCalibration(
     candidates: tuple[float, ...] = ()
     reliable: bool = True
     findings: tuple[Reason, ...] = ()
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.row_time is not None:
-            check_number("row_time", self.row_time, above=0.0)
 
     def summary(self) -> str:
         """The measured values of the sensor, and what is not determined."""
