@@ -182,10 +182,11 @@ def compared_readouts(fit: WindowFit, timing: SensorTiming, size: tuple[int, int
         most = _AS_WELL * fit.unexplained if fit.tones else 0.0
         agreeing = [part for (of, part), value in left.items() if of is rows and 0 < part != 1 and value < most]
         of_agreeing = tuple(map(with_its_tones, sorted(agreeing, key=lambda one: abs(math.log(one)))))
-        return fit.path(blur=blur_ratio(fit, timing, size) if fit.tones else (0.0, 0.0), agreeing=of_agreeing)
+        blur = blur_ratio(fit, timing, size) if fit.tones else (0.0, 0.0)
+        return replace(fit.path(), blur=blur, agreeing=of_agreeing)
     # 3. Frames whose columns are read one after another are moved as a whole.
     most = _CONTRADICTED * left[of, part]
     alike = sorted((value, one) for (its, one), value in left.items() if its is of is rows and value < most)
     names = " or ".join([*dict.fromkeys(name(one) for _, one in alike)][:3]) or "column by column"
     found = names, math.sqrt(fit.unexplained), math.sqrt(other.unexplained)
-    return other.path(found, part=part if of is rows else 0.0)
+    return replace(other.path(), other_readout=found, part=part if of is rows else 0.0)

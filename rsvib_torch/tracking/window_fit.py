@@ -93,11 +93,12 @@ class WindowPath:
     residual_of_most: float  # px, likewise; where the path is that of a layer, from four fifths of all corners
     # how the rows are read instead, if the corners contradict the stated readout, and px, median residuals by the path
     # with the stated and with this readout
-    other_readout: tuple[str, float, float] | None
+    other_readout: tuple[str, float, float] | None = None
     # part of the stated time of the readout, by which the path and the tones displace the rows; 0: as columns do
-    part: float
-    blur: tuple[float, float]  # ``blur_ratio``; 0 if it is unknown
-    agreeing: tuple[str, ...]  # other readouts that explain the corners as well, and the frequencies of their tones
+    part: float = 1.0
+    blur: tuple[float, float] = (0.0, 0.0)  # ``blur_ratio``; 0 if it is unknown
+    # other readouts that explain the corners as well, and the frequencies of their tones
+    agreeing: tuple[str, ...] = ()
 
     def path(self, times: Array, derivative: int = 0) -> Array:
         """(N, 4) components of the path, or their derivatives, at times (N,) in s."""
@@ -292,14 +293,6 @@ class WindowFit:
             tone = WindowTone(axis, frequency, knots, self.start - self.origin, self.envelope_step, slope)
             self.tones.append(tone)
 
-    def with_tone(self, axis: int, frequency: float, slope: float) -> "WindowFit":
-        """The fit with one more tone."""
-        other = copy(self)
-        other.tones, other.weights = [*map(copy, self.tones)], self.layer.astype(np.float64)
-        other.add_tones([(axis, frequency)], slope)
-        other.solve(1)
-        return other
-
     def with_aliases(self, axis: int, frequency: float, slope: float, limits: Array) -> list["WindowFit"]:
         """The fit with a tone or one of its aliases between ``limits`` in Hz, the best first.
 
@@ -308,7 +301,12 @@ class WindowFit:
         """
         aliases = frequency + np.arange(-_ALIASES, _ALIASES + 1) / self.interval
         inside = (aliases > limits[0]) & (aliases < limits[1]) & self.is_apart(axis, aliases)
-        trials = [self.with_tone(axis, alias, slope) for alias in aliases[inside | (aliases == frequency)].tolist()]
+        trials = list[WindowFit]()
+        for alias in aliases[inside | (aliases == frequency)].tolist():
+            trials.append(trial := copy(self))
+            trial.tones, trial.weights = [*map(copy, self.tones)], self.layer.astype(np.float64)
+            trial.add_tones([(axis, alias)], slope)
+            trial.solve(1)
         return sorted(trials, key=lambda trial: trial.unexplained)
 
     def with_distinct_tones(self, limits: Array) -> "WindowFit | None":
@@ -389,21 +387,14 @@ class WindowFit:
                     largest = max(largest, abs(float(triangle[5, 6] / triangle[5, 5])))
         return largest
 
-    def path(
-        self,
-        other_readout: tuple[str, float, float] | None = None,
-        *,
-        part: float = 1.0,
-        blur: tuple[float, float] = (0.0, 0.0),
-        agreeing: tuple[str, ...] = (),
-    ) -> WindowPath:
-        """The result of the fit; the arguments are those of ``WindowPath``."""
+    def path(self) -> WindowPath:
+        """The result of the fit."""
         knots = self.knots.T / np.array([1.0, 1.0, self.reach, self.reach])
         residual = residual_of_most = float(np.median(self.distance)) / _HALF
         if not self.layer.all():  # with a subject on 40 % of the frame, tones of 0.1 px were found that are none
             residual_of_most = float(np.quantile(self.distance, 0.8)) / _FOUR_FIFTHS
-        of_window, of_fit = (self.origin, self.start, self.step, knots, tuple(self.tones)), (residual, residual_of_most)
-        return WindowPath(*of_window, *of_fit, other_readout, part, blur, agreeing)
+        tones = tuple(self.tones)
+        return WindowPath(self.origin, self.start, self.step, knots, tones, residual, residual_of_most)
 
     def is_apart_from(self, frequency: float, others: Array) -> NDArray[np.bool_]:
         """Whether other frequencies are not those of a tone, nor of a change of its amplitude."""
