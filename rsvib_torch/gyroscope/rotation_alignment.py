@@ -135,34 +135,6 @@ class RotationAlignment(
         )
 
 
-def offset_range(
-    start: float, end: float, first: float, last: float, limits: tuple[float, float] | None
-) -> tuple[float, float]:
-    """Range of offsets in s, within ``limits``, for which a recording covers the time from ``first`` to ``last``."""
-    low, high = start - first, end - last
-    if high < low:
-        raise ValueError(
-            f"the recording of {end - start:.7g} s is shorter than the frames, which take {last - first:.7g} s with "
-            "their readout; use fewer frames, or check the unit of its times"
-        )
-    if limits is not None:
-        bounds = (check_number("offsets", limits[0]), check_number("offsets", limits[1]))
-        if bounds[1] < low or bounds[0] > high or bounds[1] < bounds[0]:
-            raise ValueError(
-                f"offsets {bounds[0]:g} to {bounds[1]:g} s: the recording covers the frames from {low:.6g} to "
-                f"{high:.6g} s"
-            )
-        low, high = max(low, bounds[0]), min(high, bounds[1])
-    return low, high
-
-
-def outside(offset: float, std: float, limits: tuple[float, float] | None) -> list[Reason]:
-    """The reason against an offset in s outside ``limits`` by more than 4 standard deviations."""
-    if limits is None or limits[0] - 4 * std <= offset <= limits[1] + 4 * std:
-        return []
-    return [Reason("offset_outside", None, offset, limits[0] if offset < limits[0] else limits[1])]
-
-
 @option_group
 class AlignOptions(MaskedInputOptions):
     """Options of ``align_motion``."""
@@ -193,7 +165,21 @@ def align_rates(
     rows = tracks.size[int(timing.scan_axis)]
     begin, last = float(tracks.starts[0, 0]), float(tracks.starts[-1, 1])
     last += rows * timing.row_time + timing.exposure_time
-    limits = offset_range(rates.start, rates.end, begin, last, offsets)
+    # The offsets at which the recording covers the frames.
+    low, high = rates.start - begin, rates.end - last
+    if high < low:
+        raise ValueError(
+            f"the recording of {rates.end - rates.start:.7g} s is shorter than the frames, which take "
+            f"{last - begin:.7g} s with their readout; use fewer frames, or check the unit of its times"
+        )
+    limits = low, high
+    if offsets is not None:
+        least, most = (check_number("offsets", limit) for limit in offsets)
+        limits = max(low, least), min(high, most)
+        if most < least or limits[1] < limits[0]:
+            raise ValueError(
+                f"offsets {least:g} to {most:g} s: the recording covers the frames from {low:.6g} to {high:.6g} s"
+            )
     middle = 0.5 * (begin + last)
     free = (True, True, True, True, options.fit_scale, camera is None, options.fit_row_time)
 
@@ -252,7 +238,9 @@ def _result(
     moved = model.components(fit.parameters, model.tracks.times(row_time))  # of the rows of the corners
     moved = (moved - moved.mean(0)).square().mean(0).sqrt()
     reasons = recording_reasons(moved[:2].tolist(), unexplained[:2].tolist(), other)
-    reasons += ambiguous + _uncertain(fit, std) + outside(offset, offset_std, offsets)
+    reasons += ambiguous + _uncertain(fit, std)
+    if offsets is not None and not offsets[0] - 4 * offset_std <= offset <= offsets[1] + 4 * offset_std:
+        reasons.append(Reason("offset_outside", None, offset, offsets[0] if offset < offsets[0] else offsets[1]))
     steps = model.rates.times.diff()
     inside = (model.rates.times[1:] > clock[0]) & (model.rates.times[:-1] < clock[1])
     longest, allowed = max(steps[inside].tolist(), default=float(clock[1] - clock[0])), 4 * float(steps.median())

@@ -320,20 +320,15 @@ class VibrationTracker:
         scene = scene or _Scene(gradients, differential_motion([gradients], 1, uniform=False), path)
         scene = replace(scene, age=scene.age + 1)
         state = replace(state, path=state.path - corrected.path(-step))
-        return self._followed(track, state, corrected, measurements, scene, spectra)
+        return self._followed(
+            state, replace(track, filter=corrected, spectra=spectra, scene=scene), scene, measurements
+        )
 
-    def _followed(
-        self,
-        track: _Track,
-        state: _State,
-        corrected: ToneFilter,
-        measurements: Measurements,
-        scene: _Scene,
-        spectra: RowSpectra,
-    ) -> _State:
-        """The state with a corrected filter, whose tones are judged by the rows of the last frame."""
+    def _followed(self, state: _State, track: _Track, scene: _Scene, measurements: Measurements) -> _State:
+        """The state with a track from the frame before, whose tones are judged by the rows of the last frame."""
         # 1. Rows far from where the motion places them are not measured correctly.
-        frame, centre, height = state.frames[-1], corrected.time, state.frames[-1].images.shape[-2]
+        frame, height = state.frames[-1], state.frames[-1].images.shape[-2]
+        corrected, centre = track.filter, track.filter.time
         by_tones, by_drift = corrected.explained(measurements, centre)
         residual = measurements.displacements - by_tones - by_drift
         other = OtherMotion.of(measurements, by_tones, residual, scene.differential)
@@ -373,7 +368,7 @@ class VibrationTracker:
         # an axis whose rows are far from its tones is not moved until these are reliable again
         lost = ~trusted & (other.unexplained[0] > _MAX_LEFT * np.sqrt(np.square(by_tones).mean((0, 1, 2))))
         trusted_axes = tuple(one & ~lost for one in (*track.trusted, trusted)[-self.options.window :])
-        track = _Track(corrected, spectra, frame.time, track.columns, scene, tones, trusted_axes)
+        track = replace(track, start=frame.time, tones=tones, trusted=trusted_axes)
         if any(contradicted_axes(tones.findings)):
             return replace(state, track=track, contradictions=state.contradictions + 1)
         return replace(state, track=track, contradictions=0, attempts=0)
