@@ -238,7 +238,21 @@ def _result(
     moved = model.components(fit.parameters, model.tracks.times(row_time))  # of the rows of the corners
     moved = (moved - moved.mean(0)).square().mean(0).sqrt()
     reasons = recording_reasons(moved[:2].tolist(), unexplained[:2].tolist(), other)
-    reasons += ambiguous + _uncertain(fit, std)
+    reasons += ambiguous
+    # Parameters that are not determined.
+    *_, fits_focal_length, fits_row_time = model.free
+    side, allowed = max(model.tracks.size), _MAX_FOCAL_LENGTH_STD * focal_length
+    if std[5] > allowed:
+        details = {"focal_length": focal_length}
+        reasons.append(Reason("focal_length_uncertain", None, float(std[5]), allowed, details))
+    shortest, longest = (sides * side for sides in _FOCAL_LENGTHS)
+    if fits_focal_length and not shortest <= focal_length <= longest:
+        limit = shortest if focal_length < shortest else longest
+        reasons.append(Reason("focal_length_implausible", None, focal_length, limit, {"times": focal_length / side}))
+    if fits_row_time and std[6] > _MAX_ROW_TIME_STD * row_time:
+        reasons.append(Reason("row_time_uncertain", None, float(std[6]) / row_time, _MAX_ROW_TIME_STD))
+    if not math.isfinite(float(std.sum())):
+        reasons.append(Reason("fit_not_converged"))
     if offsets is not None and not offsets[0] - 4 * offset_std <= offset <= offsets[1] + 4 * offset_std:
         reasons.append(Reason("offset_outside", None, offset, offsets[0] if offset < offsets[0] else offsets[1]))
     steps = model.rates.times.diff()
@@ -272,28 +286,6 @@ def _result(
         reliable=not reasons,
         findings=tuple(reasons),
     )
-
-
-def _uncertain(fit: RotationFit, std: Tensor) -> list[Reason]:
-    """Reasons against parameters that are not determined, with standard deviations (7,)."""
-    reasons = []
-    *_, fits_focal_length, fits_row_time = fit.model.free
-    side = max(fit.model.tracks.size)
-    focal_length, row_time = fit.parameters[5:7].tolist()
-    focal_length_std, row_time_std = std[5:7].tolist()
-    allowed = _MAX_FOCAL_LENGTH_STD * focal_length
-    if focal_length_std > allowed:
-        details = {"focal_length": focal_length}
-        reasons.append(Reason("focal_length_uncertain", None, focal_length_std, allowed, details))
-    shortest, longest = (sides * side for sides in _FOCAL_LENGTHS)
-    if fits_focal_length and not shortest <= focal_length <= longest:
-        limit = shortest if focal_length < shortest else longest
-        reasons.append(Reason("focal_length_implausible", None, focal_length, limit, {"times": focal_length / side}))
-    if fits_row_time and row_time_std > _MAX_ROW_TIME_STD * row_time:
-        reasons.append(Reason("row_time_uncertain", None, row_time_std / row_time, _MAX_ROW_TIME_STD))
-    if not math.isfinite(float(std.sum())):
-        reasons.append(Reason("fit_not_converged"))
-    return reasons
 
 
 def _motion(fit: RotationFit, clock: Tensor, margin: int = 4) -> FreeMotion:

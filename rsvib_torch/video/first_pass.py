@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
 
@@ -53,15 +53,12 @@ class FirstPass:
 
     def pairs(self, progress: Callable[[], None]) -> Iterator[Corners | None]:
         """Corners between each usable frame and the one before; a thread follows them, up to a window ahead."""
-        with closing(prefetched(self._followed(), WINDOW_FRAMES)) as frames:
-            for corners in frames:
-                progress()
-                yield from corners
-
-    def _followed(self) -> Generator[tuple[Corners | None, ...], None, None]:
         with closing(self._frames.decoded()) as frames:
-            for index, frame in enumerate(frames):
-                yield self._next(index, frame)
+            known = (self._next(index, frame) for index, frame in enumerate(frames))
+            with closing(prefetched(known, WINDOW_FRAMES)) as followed:
+                for corners in followed:
+                    progress()
+                    yield from corners
 
     def _next(self, index: int, frame: Frame | str) -> tuple[Corners | None, ...]:
         """The corners between usable frames that are known with a frame."""
