@@ -27,6 +27,7 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.numerics.interpolation import mirrored
 from rsvib_torch.numerics.tables import Array
+from rsvib_torch.registration.corners import eight_bits
 from rsvib_torch.restoration.restore import WITH_SATURATION, restore_prepared
 from rsvib_torch.stacks.job import StackJob, stored_frame
 
@@ -87,9 +88,8 @@ class VideoFrames:
         luma = luma if luma.ndim == 2 else luma.mean(0)
         if luma.dtype == np.uint8:
             return luma.astype(np.uint8, copy=False)
-        low, high = np.nanpercentile(luma[::4, ::4], (0.1, 99.9))  # the full scale may be far beyond the content
-        counts: NDArray[np.float64] = (np.nan_to_num(luma, nan=low) - low) * (255.0 / max(high - low, 1e-30))
-        return counts.round().clip(0, 255).astype(np.uint8)
+        levels = np.nanpercentile(luma[::4, ::4], (0.1, 99.9))  # the full scale may be far beyond the content
+        return eight_bits(np.nan_to_num(luma, nan=levels[0]), levels)
 
     def planes(self, frame: Frame) -> list[Frame]:
         """Planes (..., H, W): all pixels, or Y (H, W) and the chroma (2, H / 2, W / 2)."""
