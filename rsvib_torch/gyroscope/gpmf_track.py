@@ -36,15 +36,11 @@ class _Packet:
     start: float  # s
     duration: float  # s
     streams: list[_Stream]  # of the device that has a gyroscope, or of the first one
-
-    @property
-    def gyroscope(self) -> _Stream | None:
-        """The stream with angular rates."""
-        return next((stream for stream in self.streams if b"GYRO" in stream), None)
+    gyroscope: _Stream  # that with angular rates; empty if there is none
 
     def stated(self, key: bytes) -> float:
         """The first value of an entry of the gyroscope; NaN without one."""
-        return float((self.gyroscope or {}).get(key, np.full((1, 1), np.nan))[0, 0])
+        return float(self.gyroscope.get(key, np.full((1, 1), np.nan))[0, 0])
 
 
 @dataclass(frozen=True)
@@ -89,8 +85,8 @@ def read_gpmf(path: Path) -> tuple[Array, Array, str, str]:
     """Times (N,) in s, rates (N, 3) in rad/s, a description and the axes of the first gyroscope in a GPMF track."""
     try:
         track = _packets(path)
-        packets = [packet for packet in track if packet.gyroscope is not None]
-        rates = [_rates(packet.gyroscope or {}) for packet in packets]
+        packets = [packet for packet in track if packet.gyroscope]
+        rates = [_rates(packet.gyroscope) for packet in packets]
         times = _sample_times(packets, np.array([len(part) for part in rates])) if packets else _NONE
     except ValueError as error:
         raise ValueError(f"{path}: damaged MP4 file: {error}") from error
@@ -98,7 +94,7 @@ def read_gpmf(path: Path) -> tuple[Array, Array, str, str]:
         raise ValueError(
             f"{path}: a video without a GPMF track (gpmd) that has angular rates (GYRO); read them from another file"
         )
-    letters = (bytes((packet.gyroscope or {}).get(b"ORIN", _NONE).astype(np.uint8)) for packet in packets)
+    letters = (bytes(packet.gyroscope.get(b"ORIN", _NONE).astype(np.uint8)) for packet in packets)
     axes = next(filter(None, (text.decode("latin-1").strip("\0 ") for text in letters)), "")
     source = f"GPMF track, {len(packets)} packets" + (f", axes {axes}" if axes else "")
     if CameraTrack.of(track).stabilised:
@@ -138,13 +134,11 @@ def _packets(path: Path) -> list[_Packet]:
                     if len(packets) == _MAX_PACKETS:
                         raise ValueError(f"more than {_MAX_PACKETS:,} GPMF packets")
                     start, duration = (float((ticks or 0) * unit) for ticks in (packet.pts, packet.duration))
-                    devices = [
-                        _Packet(start, duration, [_stream(content) for content in _contents(device, b"STRM")])
-                        for device in _contents(data, b"DEVC")
-                    ]
+                    devices = [[*map(_stream, _contents(device, b"STRM"))] for device in _contents(data, b"DEVC")]
                     if not devices:
                         raise ValueError(f"GPMF packet {len(packets)} has no device (DEVC)")
-                    packets.append(next((device for device in devices if device.gyroscope is not None), devices[0]))
+                    rated = [(device, stream) for device in devices for stream in device if b"GYRO" in stream]
+                    packets.append(_Packet(start, duration, *(rated[0] if rated else (devices[0], {}))))
                 if packets:
                     return packets
                 container.seek(0)

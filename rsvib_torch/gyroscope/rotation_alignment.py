@@ -135,34 +135,6 @@ class RotationAlignment(
         )
 
 
-def offset_range(
-    start: float, end: float, first: float, last: float, limits: tuple[float, float] | None
-) -> tuple[float, float]:
-    """Range of offsets in s, within ``limits``, for which a recording covers the time from ``first`` to ``last``."""
-    low, high = start - first, end - last
-    if high < low:
-        raise ValueError(
-            f"the recording of {end - start:.7g} s is shorter than the frames, which take {last - first:.7g} s with "
-            "their readout; use fewer frames, or check the unit of its times"
-        )
-    if limits is not None:
-        bounds = (check_number("offsets", limits[0]), check_number("offsets", limits[1]))
-        if bounds[1] < low or bounds[0] > high or bounds[1] < bounds[0]:
-            raise ValueError(
-                f"offsets {bounds[0]:g} to {bounds[1]:g} s: the recording covers the frames from {low:.6g} to "
-                f"{high:.6g} s"
-            )
-        low, high = max(low, bounds[0]), min(high, bounds[1])
-    return low, high
-
-
-def outside(offset: float, std: float, limits: tuple[float, float] | None) -> list[Reason]:
-    """The reason against an offset in s outside ``limits`` by more than 4 standard deviations."""
-    if limits is None or limits[0] - 4 * std <= offset <= limits[1] + 4 * std:
-        return []
-    return [Reason("offset_outside", None, offset, limits[0] if offset < limits[0] else limits[1])]
-
-
 @option_group
 class AlignOptions(MaskedInputOptions):
     """Options of ``align_motion``."""
@@ -193,7 +165,21 @@ def align_rates(
     rows = tracks.size[int(timing.scan_axis)]
     begin, last = float(tracks.starts[0, 0]), float(tracks.starts[-1, 1])
     last += rows * timing.row_time + timing.exposure_time
-    limits = offset_range(rates.start, rates.end, begin, last, offsets)
+    # The offsets at which the recording covers the frames.
+    low, high = rates.start - begin, rates.end - last
+    if high < low:
+        raise ValueError(
+            f"the recording of {rates.end - rates.start:.7g} s is shorter than the frames, which take "
+            f"{last - begin:.7g} s with their readout; use fewer frames, or check the unit of its times"
+        )
+    limits = low, high
+    if offsets is not None:
+        least, most = (check_number("offsets", limit) for limit in offsets)
+        limits = max(low, least), min(high, most)
+        if most < least or limits[1] < limits[0]:
+            raise ValueError(
+                f"offsets {least:g} to {most:g} s: the recording covers the frames from {low:.6g} to {high:.6g} s"
+            )
     middle = 0.5 * (begin + last)
     free = (True, True, True, True, options.fit_scale, camera is None, options.fit_row_time)
 
@@ -252,7 +238,23 @@ def _result(
     moved = model.components(fit.parameters, model.tracks.times(row_time))  # of the rows of the corners
     moved = (moved - moved.mean(0)).square().mean(0).sqrt()
     reasons = recording_reasons(moved[:2].tolist(), unexplained[:2].tolist(), other)
-    reasons += ambiguous + _uncertain(fit, std) + outside(offset, offset_std, offsets)
+    reasons += ambiguous
+    # Parameters that are not determined.
+    *_, fits_focal_length, fits_row_time = model.free
+    side, allowed = max(model.tracks.size), _MAX_FOCAL_LENGTH_STD * focal_length
+    if std[5] > allowed:
+        details = {"focal_length": focal_length}
+        reasons.append(Reason("focal_length_uncertain", None, float(std[5]), allowed, details))
+    shortest, longest = (sides * side for sides in _FOCAL_LENGTHS)
+    if fits_focal_length and not shortest <= focal_length <= longest:
+        limit = shortest if focal_length < shortest else longest
+        reasons.append(Reason("focal_length_implausible", None, focal_length, limit, {"times": focal_length / side}))
+    if fits_row_time and std[6] > _MAX_ROW_TIME_STD * row_time:
+        reasons.append(Reason("row_time_uncertain", None, float(std[6]) / row_time, _MAX_ROW_TIME_STD))
+    if not math.isfinite(float(std.sum())):
+        reasons.append(Reason("fit_not_converged"))
+    if offsets is not None and not offsets[0] - 4 * offset_std <= offset <= offsets[1] + 4 * offset_std:
+        reasons.append(Reason("offset_outside", None, offset, offsets[0] if offset < offsets[0] else offsets[1]))
     steps = model.rates.times.diff()
     inside = (model.rates.times[1:] > clock[0]) & (model.rates.times[:-1] < clock[1])
     longest, allowed = max(steps[inside].tolist(), default=float(clock[1] - clock[0])), 4 * float(steps.median())
@@ -284,28 +286,6 @@ def _result(
         reliable=not reasons,
         findings=tuple(reasons),
     )
-
-
-def _uncertain(fit: RotationFit, std: Tensor) -> list[Reason]:
-    """Reasons against parameters that are not determined, with standard deviations (7,)."""
-    reasons = []
-    *_, fits_focal_length, fits_row_time = fit.model.free
-    side = max(fit.model.tracks.size)
-    focal_length, row_time = fit.parameters[5:7].tolist()
-    focal_length_std, row_time_std = std[5:7].tolist()
-    allowed = _MAX_FOCAL_LENGTH_STD * focal_length
-    if focal_length_std > allowed:
-        details = {"focal_length": focal_length}
-        reasons.append(Reason("focal_length_uncertain", None, focal_length_std, allowed, details))
-    shortest, longest = (sides * side for sides in _FOCAL_LENGTHS)
-    if fits_focal_length and not shortest <= focal_length <= longest:
-        limit = shortest if focal_length < shortest else longest
-        reasons.append(Reason("focal_length_implausible", None, focal_length, limit, {"times": focal_length / side}))
-    if fits_row_time and row_time_std > _MAX_ROW_TIME_STD * row_time:
-        reasons.append(Reason("row_time_uncertain", None, row_time_std / row_time, _MAX_ROW_TIME_STD))
-    if not math.isfinite(float(std.sum())):
-        reasons.append(Reason("fit_not_converged"))
-    return reasons
 
 
 def _motion(fit: RotationFit, clock: Tensor, margin: int = 4) -> FreeMotion:

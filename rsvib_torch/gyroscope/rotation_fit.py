@@ -150,7 +150,7 @@ class RotationFit:
 
     def stepped(self) -> "RotationFit":
         """The fit after a step of Gauss-Newton with the same weights."""
-        return _solved(self, _linear(self, _Residuals.at(self)))[0]
+        return _solved(self, _linear(self, *_residuals(self)))[0]
 
     def information(self) -> Tensor:
         """(M, 2, 2) px^-2, inverse covariances of the displacements of the corners."""
@@ -177,20 +177,11 @@ def _sums(tracks: CornerTracks, values: Tensor) -> Tensor:
     return values.new_zeros(len(tracks.starts), *values.shape[1:]).index_add(0, tracks.pair, values)
 
 
-@dataclass(frozen=True, eq=False)
-class _Residuals:
-    """Displacements beside the rotation, and their derivatives."""
-
-    values: Tensor  # (M, 2) px
-    slopes: Tensor  # (M, 2, 7) of the prediction by the parameters
-    turned: Tensor  # (M, 2, 3) of the prediction by the effects X, Y, radius theta
-
-    @classmethod
-    def at(cls, fit: RotationFit) -> "_Residuals":
-        tracks = fit.model.tracks
-        slopes, factors = fit.model.slopes(fit.parameters)
-        turned = factors * factors.new_tensor([1.0, 1.0, 1 / tracks.radius])
-        return cls(tracks.offsets - fit.model.predicted(fit.parameters), slopes, turned)
+def _residuals(fit: RotationFit) -> tuple[Tensor, Tensor, Tensor]:
+    """Displacements (M, 2) px beside the rotation; the slopes (M, 2, 7), and those by X, Y, radius theta (M, 2, 3)."""
+    tracks, (slopes, factors) = fit.model.tracks, fit.model.slopes(fit.parameters)
+    turned = factors * factors.new_tensor([1.0, 1.0, 1 / tracks.radius])
+    return tracks.offsets - fit.model.predicted(fit.parameters), slopes, turned
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,10 +196,11 @@ class _Linear:
     line: Tensor  # (M,) px, length of the parallax of a corner at the mean distance
 
 
-def _linear(fit: RotationFit, rest: _Residuals) -> _Linear:
-    tracks, errors, slopes, turned = fit.model.tracks, fit.errors, rest.slopes, rest.turned
+def _linear(fit: RotationFit, values: Tensor, slopes: Tensor, turned: Tensor) -> _Linear:
+    """The arguments are ``_residuals``."""
+    tracks, errors = fit.model.tracks, fit.errors
     by_translation = torch.stack([_parallax(fit, axis) for axis in torch.eye(3, dtype=torch.float64)], -1)
-    residual = rest.values - (turned @ fit.effects[tracks.pair, :3, None])[..., 0]
+    residual = values - (turned @ fit.effects[tracks.pair, :3, None])[..., 0]
 
     # 1. Coordinates across and along the lines of the parallax.
     parallax = fit.parallax()
@@ -335,7 +327,7 @@ def fit_robustly(model: RotationModel, start: Tensor) -> RotationFit:
     # 3. A translation must explain more than noise, as it has a part of every rotation: across its lines.
     line = moving.parallax()
     rest = tracks.offsets - model.predicted(still.parameters)
-    rest = rest - (_Residuals.at(still).turned @ still.effects[tracks.pair, :3, None])[..., 0]
+    rest = rest - (_residuals(still)[2] @ still.effects[tracks.pair, :3, None])[..., 0]
     off = (rest[:, 0] * line[:, 1] - rest[:, 1] * line[:, 0]) / line.norm(dim=-1).clamp(min=1e-9)
     across = 1.4826 * float(off[still.errors.weight > 0].abs().median())
     simpler = across < (1 + _SIGNIFICANT / len(off) ** 0.5) * moving.errors.sigma
@@ -345,9 +337,9 @@ def fit_robustly(model: RotationModel, start: Tensor) -> RotationFit:
 def _weighted(fit: RotationFit, follows: Tensor) -> RotationFit:
     """Rounds of Gauss-Newton, weights and variances."""
     for number in range(_ROUNDS):
-        rest, before = _Residuals.at(fit), fit.parameters
-        fit, of_effects, _ = _solved(fit, _linear(fit, rest))
-        linear = _linear(fit, replace(rest, values=rest.values - rest.slopes @ (fit.parameters - before)))
+        (values, slopes, turned), before = _residuals(fit), fit.parameters
+        fit, of_effects, _ = _solved(fit, _linear(fit, values, slopes, turned))
+        linear = _linear(fit, values - slopes @ (fit.parameters - before), slopes, turned)
         errors = _weighed(fit, linear, of_effects, follows)
         fit = replace(fit, errors=replace(errors, effects=fit.errors.effects) if number < _HELD_ROUNDS else errors)
     return fit
@@ -367,8 +359,8 @@ def _with_correlated_errors(fit: RotationFit) -> RotationFit:
     rho = (first * later).sum(0) / (0.5 * (first.square() + later.square()).sum(0)).clamp(min=1e-300)
     rho = rho.clamp(0.0, 0.9) if pairs > 8 else torch.zeros(6).to(rho)  # fewer pairs have no known correlation
     wide = errors.effects * ((1 + rho) / (1 - rho) * pairs / max(pairs - int(free.sum()) / 3, 1.0)).sqrt()
-    rest = _Residuals.at(fit)
-    linear, wider = _linear(fit, rest), replace(fit, errors=replace(errors, effects=wide))
+    values, slopes, turned = _residuals(fit)
+    linear, wider = _linear(fit, values, slopes, turned), replace(fit, errors=replace(errors, effects=wide))
     moved, _, influence = _solved(wider, linear)
     cells = influence.new_zeros(CELL_ROWS * CELL_COLUMNS, 7).index_add(0, tracks.cell, influence)
     occupied = max(int((cells.abs().sum(-1) > 0).sum()), 2)
@@ -384,8 +376,8 @@ def _with_correlated_errors(fit: RotationFit) -> RotationFit:
     for _ in range(_DRAWS):
         drawn = noise * torch.randn(rates.rates.shape, dtype=torch.float64, generator=generator)
         noisy = replace(fit.model, rates=replace(rates, rates=rates.rates + drawn))
-        changed = replace(rest, values=rest.values + predicted - noisy.predicted(fit.parameters))
-        change = _linear(fit, changed).residual - linear.residual
+        changed = values + predicted - noisy.predicted(fit.parameters)
+        change = _linear(fit, changed, slopes, turned).residual - linear.residual
         by_noise = _solved(wider, replace(linear, residual=change))[2].sum(0)
         covariance = covariance + torch.outer(by_noise, by_noise) / _DRAWS
     # Errors in proportion to the displacements, which change neither the bias nor the time of the middle row.

@@ -19,7 +19,7 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.registration.corners import CornerFollower, Corners, eight_bits
 from rsvib_torch.row_time.by_tones import CameraClock, RowTimeFit
-from rsvib_torch.tracking.window_fit import WindowPath, averaging, distances_left, fit_window
+from rsvib_torch.tracking.window_fit import ROUNDS, WindowFit, WindowPath, averaging, fit_window
 
 _MAX_STD = 0.05  # of the row time; a twentieth of what the rows are displaced by remains in restored frames
 _ROUGH = 0.25  # of the row time, standard deviation up to which a result is stated
@@ -59,8 +59,10 @@ class _FollowedCorners:
 
         It is left by a path and ``tones``, of which axis and frequency in Hz are given.
         """
-        distance = distances_left(self.timed(row_time), self.clock.period, self._averaged(row_time), tones)
-        return np.array([[np.median(distance[part]) for part in parts] for parts in self.groups]) ** 2
+        fit = WindowFit(self.timed(row_time), self.clock.period, self._averaged(row_time))
+        fit.add_tones(tones)
+        fit.solve(ROUNDS)
+        return np.array([[np.median(fit.distance[part]) for part in parts] for parts in self.groups]) ** 2
 
     def window(self, row_time: float) -> WindowPath:
         """The path and the tones at a row time."""

@@ -6,6 +6,7 @@ heel strikes, a prediction is wrong by several px, and a roll of the camera look
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Self
 
 import cv2
@@ -14,48 +15,38 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.numerics.tables import Array, table
+from rsvib_torch.numerics.tables import Array
 from rsvib_torch.tracking.window_fit import ROUNDS, robust_weights
 
 _HEIGHT = 240  # px, to which frames are reduced to compare them as a whole
 _LEAST_PEAK = 0.1  # of a phase correlation; that of frames without a scene in common is lower
 
 
-def _nowhere() -> Tensor:
-    return torch.zeros(2, dtype=torch.float64, device="cpu")
+_zeros = partial(np.zeros, 2)
 
 
 @dataclass(frozen=True, eq=False)
 class LivePath:
     """The path so far, and the displacement of the last frame in the steady image."""
 
-    moved: Array = field(default_factory=lambda: np.zeros(2))  # (2,) px to the last measured frame, in row order
-    places: tuple[tuple[float, Tensor], ...] = ()  # times and places of the frames that the steady image follows
-    shift: Tensor = field(default_factory=_nowhere)  # (2,) px, of the last frame
-    held: Tensor = field(default_factory=_nowhere)  # (2,) px, part of it that is left from before the path was known
+    moved: Array = field(default_factory=_zeros)  # (2,) px to the last measured frame, in row order
+    places: tuple[Array, ...] = ()  # (3,) time, x and y of the frames that the steady image follows
+    shift: Array = field(default_factory=_zeros)  # (2,) px, of the last frame
+    held: Array = field(default_factory=_zeros)  # (2,) px, part of it that is left from before the path was known
 
-    def steadied(self, time: float, place: Tensor | None, step: float, duration: float) -> Self:
+    def steadied(self, time: float, place: Array, step: float, duration: float) -> Self:
         """The path with the displacement of a frame at a ``time``, a ``step`` behind the frame before, in s.
 
         It leads from the place of the frame to a straight line through the last ``duration``. While the place is not
-        known (None), and from where it is known again, the displacement of the frames before fades: nothing jumps.
+        known (NaN), and from where it is known again, the displacement of the frames before fades: nothing jumps.
         """
         fade = math.exp(-step / duration)
-        if place is None:
-            shift = fade * self.shift
-            return replace(self, places=(), shift=shift, held=shift)
-        places = tuple(one for one in (*self.places, (time, place)) if one[0] >= time - duration)
-        held = fade * self.held.to(place)
-        return replace(self, places=places, shift=place - _end_of_line(places) + held, held=held)
-
-
-def _end_of_line(places: tuple[tuple[float, Tensor], ...]) -> Tensor:
-    """(2,) px, place at the last time of the straight line that fits places (2,) at times in s."""
-    last, place = places[-1]
-    if len(places) < 3:
-        return place
-    times = np.array([time for time, _ in places]) - last
-    return place.new_tensor(np.polyfit(times, table(torch.stack([place for _, place in places])), 1)[1])
+        if np.isnan(place).any():
+            return replace(self, places=(), shift=fade * self.shift, held=fade * self.shift)
+        places = tuple(one for one in (*self.places, np.append(time, place)) if one[0] >= time - duration)
+        line = np.polyfit(np.array(places)[:, 0] - time, np.array(places)[:, 1:], min(len(places) - 1, 1))
+        held = fade * self.held
+        return replace(self, places=places, shift=place - line[-1] + held, held=held)
 
 
 def step_of_rows(measurements: Measurements, displacements: Array, middle: float) -> Array:

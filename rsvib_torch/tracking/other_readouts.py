@@ -12,11 +12,12 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.tracking.window_blur import blur_ratio
-from rsvib_torch.tracking.window_fit import MIN_RATIO, ROUNDS, SearchedFrequencies, WindowFit, WindowPath
+from rsvib_torch.tracking.window_fit import MIN_RATIO, ROUNDS, WindowFit, WindowPath
 
 _WITHOUT_TONES = 0.5, 0.7, 1.4, 2.0  # parts of the time of a readout that are compared where there are no tones
 _LEAST_PART = 0.4  # of those that tones propose; row times are guessed from the frame rate or a table
@@ -62,14 +63,14 @@ class _Wave:
 
 def _strongest_wave(fit: WindowFit, axis: int, readout: float) -> _Wave | None:
     """The wave of an axis that explains most beside the path, if it is significant."""
-    rest, grid, rate = copy(fit), fit.searched(readout), 1.0 / fit.interval
+    rest, (grid, _, is_visible), rate = copy(fit), fit.searched(readout), 1.0 / fit.interval
     rest.tones = []
 
-    def best(searched: SearchedFrequencies, parts: Array) -> list[tuple[float, float, float, float]]:
+    def best(searched: Array, wanted: NDArray[np.bool_], parts: Array) -> list[tuple[float, float, float, float]]:
         """Sum of squares that a wave explains, its frequencies, and its ratio, for parts of the frame rate."""
         found = []
         for part in parts:
-            wave, ratio, offsets = rest.strongest(axis, searched, searched.is_visible, turns=part * rate * readout)
+            wave, ratio, offsets = rest.strongest(axis, searched, wanted, turns=part * rate * readout)
             found.append((offsets**2, wave, wave + part * rate, ratio))
         return found
 
@@ -79,15 +80,13 @@ def _strongest_wave(fit: WindowFit, axis: int, readout: float) -> _Wave | None:
         largest = max(tones, key=lambda tone: float(np.abs(tone.knots).mean()))
         frequency, part = largest.frequency, 0.0
     else:
-        _, frequency, within, ratio = max(best(grid, _COARSE))
+        _, frequency, within, ratio = max(best(grid, is_visible, _COARSE))
         part = (within - frequency) / rate
         if ratio < MIN_RATIO:
             return None
     # 2. What it explains is a parabola over its frequency within a frame, around the highest value.
-    near = frequency + grid.step * np.arange(-3, 4)
-    every = np.ones(len(near), bool)
-    close = replace(grid, frequencies=near, is_resolved=every, is_visible=every)
-    found = best(close, part + _FINE)
+    near = frequency + (grid[1] - grid[0]) * np.arange(-3, 4)
+    found = best(near, np.ones(len(near), bool), part + _FINE)
     number = min(max(int(np.argmax([squares for squares, *_ in found])), 1), len(found) - 2)
     before, top, after = (squares for squares, *_ in found[number - 1 : number + 2])
     shift = 0.5 * (after - before) / max(2.0 * top - after - before, 1e-30)
@@ -182,10 +181,11 @@ def compared_readouts(fit: WindowFit, timing: SensorTiming, size: tuple[int, int
         most = _AS_WELL * fit.unexplained if fit.tones else 0.0
         agreeing = [part for (of, part), value in left.items() if of is rows and 0 < part != 1 and value < most]
         of_agreeing = tuple(map(with_its_tones, sorted(agreeing, key=lambda one: abs(math.log(one)))))
-        return fit.path(blur=blur_ratio(fit, timing, size) if fit.tones else (0.0, 0.0), agreeing=of_agreeing)
+        blur = blur_ratio(fit, timing, size) if fit.tones else (0.0, 0.0)
+        return replace(fit.path(), blur=blur, agreeing=of_agreeing)
     # 3. Frames whose columns are read one after another are moved as a whole.
     most = _CONTRADICTED * left[of, part]
     alike = sorted((value, one) for (its, one), value in left.items() if its is of is rows and value < most)
     names = " or ".join([*dict.fromkeys(name(one) for _, one in alike)][:3]) or "column by column"
     found = names, math.sqrt(fit.unexplained), math.sqrt(other.unexplained)
-    return other.path(found, part=part if of is rows else 0.0)
+    return replace(other.path(), other_readout=found, part=part if of is rows else 0.0)

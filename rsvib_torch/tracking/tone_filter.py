@@ -187,9 +187,8 @@ class ToneFilter:
         parts = parts * (np.abs(self.coefficients) > 0)[..., None, None]
         powers = _powers(middles)
         drift = np.broadcast_to(powers, (*parts.shape[:2], *powers.shape))
-        return np.concatenate([parts.reshape(*parts.shape[:2], -1, parts.shape[-1]), drift], 2).mT, offsets[
-            :, None
-        ] - sum(self._expected(wave, middles))
+        jacobian = np.concatenate([parts.reshape(*parts.shape[:2], -1, parts.shape[-1]), drift], 2).mT
+        return jacobian, offsets[:, None] - sum(self._expected(wave, middles))
 
     def _offsets(self, measurements: Measurements, origin: float) -> tuple[Array, Array]:
         """Mid-exposures (N, 2) from the reference time in s, and the measured offsets (A, N) in px."""

@@ -149,9 +149,7 @@ class _State:
     frames: tuple[_GreyFrame, ...] = ()  # the last ones that could be used, at most a window
     track: _Track | None = None  # the motion that is followed; None if it is not known
     path: Array = field(default_factory=lambda: np.zeros(2))  # (2,) px, as predicted, to the time of the filter
-    live: LivePath = field(
-        default_factory=LivePath
-    )  # from frame to frame, and where the steady image shows the last one
+    live: LivePath = field(default_factory=LivePath)  # from frame to frame, and where the steady image shows the last
     untried: int = 0  # frames since the last attempt to detect the vibration
     attempts: int = 0  # to detect the vibration, since the rows last agreed with the tones
     contradictions: int = 0  # consecutive frames, and starts of the filter, whose rows contradict the tones
@@ -243,9 +241,7 @@ class VibrationTracker:
             )
         state = replace(self._state, time=time, lost="")
         if latest.shows_nothing_new(before):
-            self._state = state
-            tracked = self._result(prepared, state, usable=False)
-            return replace(tracked, motion=replace(tracked.motion, image_shift=state.live.shift.to(tracked.path)))
+            return self._result(prepared, state, usable=False)
         longest = MAX_SPAN * self._rows.row_time  # s; frames further apart do not resolve frequencies
         recent = tuple(frame for frame in state.frames if time - frame.time <= longest)
         state = replace(state, frames=(*recent, latest)[-self.options.window :], untried=state.untried + 1)
@@ -261,15 +257,7 @@ class VibrationTracker:
         if not state.lost and (state.track is None or state.contradictions >= _PATIENCE):
             starts = tensor(np.array([*(frame.time for frame in self._state.frames), time]))
             state = replace(state, lost=contradiction(self._rows, starts, 0))
-
-        # 3. The result, moved to where the steady image is.
-        tracked = self._result(prepared, state)
-        if self.options.steady:
-            place, step = None if tracked.tones is None else tracked.path, time - self._state.time
-            state = replace(state, live=state.live.steadied(time, place, step, self.options.steady))
-            tracked = replace(tracked, motion=replace(tracked.motion, image_shift=state.live.shift.to(tracked.path)))
-        self._state = state
-        return tracked
+        return self._result(prepared, state)
 
     def _checked_time(self, time: float | None) -> float:
         before = self._state.time
@@ -332,20 +320,15 @@ class VibrationTracker:
         scene = scene or _Scene(gradients, differential_motion([gradients], 1, uniform=False), path)
         scene = replace(scene, age=scene.age + 1)
         state = replace(state, path=state.path - corrected.path(-step))
-        return self._followed(track, state, corrected, measurements, scene, spectra)
+        return self._followed(
+            state, replace(track, filter=corrected, spectra=spectra, scene=scene), scene, measurements
+        )
 
-    def _followed(
-        self,
-        track: _Track,
-        state: _State,
-        corrected: ToneFilter,
-        measurements: Measurements,
-        scene: _Scene,
-        spectra: RowSpectra,
-    ) -> _State:
-        """The state with a corrected filter, whose tones are judged by the rows of the last frame."""
+    def _followed(self, state: _State, track: _Track, scene: _Scene, measurements: Measurements) -> _State:
+        """The state with a track from the frame before, whose tones are judged by the rows of the last frame."""
         # 1. Rows far from where the motion places them are not measured correctly.
-        frame, centre, height = state.frames[-1], corrected.time, state.frames[-1].images.shape[-2]
+        frame, height = state.frames[-1], state.frames[-1].images.shape[-2]
+        corrected, centre = track.filter, track.filter.time
         by_tones, by_drift = corrected.explained(measurements, centre)
         residual = measurements.displacements - by_tones - by_drift
         other = OtherMotion.of(measurements, by_tones, residual, scene.differential)
@@ -361,12 +344,31 @@ class VibrationTracker:
         aliasing, interval = table(scene.gradients.aliasing), np.array([frame.time - track.start])
         fit = with_unknown_amplitudes(fit, aliasing, other.unexplained, interval, self._rows.exposure_time, known=0)
         measurements = replace(measurements, exposure_starts=measurements.exposure_starts + (centre - frame.time))
-        tones = self._judged(frame, fit, growth, measurements, other)
+        vibration, std = vibration_of_fit(fit)
+        known_std = displacement_std_at_frame(fit, growth, self._rows, height)[None]
+        (findings,) = judged(
+            vibration,
+            replace(std, displacement=tensor(known_std)),
+            other,
+            intervals=measurements.interval,
+            displacement=tone_displacements(
+                fit, table(self._rows.row_starts(1, height)[0, ::8]), self._rows.exposure_time
+            ).std(1),
+            known_std=known_std,
+            timing=self._rows,
+            max_tones=MAX_TONES,
+        )
+        # the tones are followed already, and some may have ended
+        findings = tuple(
+            with_remedy(_of_present_tones(of_axis, number), "use frames at shorter intervals")
+            for of_axis, number in zip(findings, fit.active[0].sum(-1), strict=True)
+        )
+        tones = TrackedTones(frame.time, fit, growth, measurements, findings, float(np.max(other.differential)))
         trusted = np.array([not against for against in tones.findings])
         # an axis whose rows are far from its tones is not moved until these are reliable again
         lost = ~trusted & (other.unexplained[0] > _MAX_LEFT * np.sqrt(np.square(by_tones).mean((0, 1, 2))))
         trusted_axes = tuple(one & ~lost for one in (*track.trusted, trusted)[-self.options.window :])
-        track = _Track(corrected, spectra, frame.time, track.columns, scene, tones, trusted_axes)
+        track = replace(track, start=frame.time, tones=tones, trusted=trusted_axes)
         if any(contradicted_axes(tones.findings)):
             return replace(state, track=track, contradictions=state.contradictions + 1)
         return replace(state, track=track, contradictions=0, attempts=0)
@@ -393,33 +395,6 @@ class VibrationTracker:
         first, last = (motion.mean_displacement(rows + start, self._rows.exposure_time) for start in starts.tolist())
         missed = step - table(last - first).reshape(-1, 2).mean(0)
         return missed if np.abs(missed).max() > _MAX_MISSED else None
-
-    def _judged(
-        self, frame: _GreyFrame, fit: ToneFit, growth: Array, measurements: Measurements, other_motion: OtherMotion
-    ) -> TrackedTones:
-        """The tones of a frame, whose first row is the time origin, with the verdict of its rows."""
-        exposure_time = self._rows.exposure_time
-        # Displacement of the rows of the frame by the tones, and its standard deviation.
-        vibration, std = vibration_of_fit(fit)
-        starts = table(self._rows.row_starts(1, frame.images.shape[-2])[0, ::8])
-        known_std = displacement_std_at_frame(fit, growth, self._rows, frame.images.shape[-2])[None]
-        (findings,) = judged(
-            vibration,
-            replace(std, displacement=tensor(known_std)),
-            other_motion,
-            intervals=measurements.interval,
-            displacement=tone_displacements(fit, starts, exposure_time).std(1),
-            known_std=known_std,
-            timing=self._rows,
-            max_tones=MAX_TONES,
-        )
-        # the tones are followed already, and some may have ended
-        findings = tuple(
-            with_remedy(_of_present_tones(of_axis, tones), "use frames at shorter intervals")
-            for of_axis, tones in zip(findings, fit.active[0].sum(-1), strict=True)
-        )
-        apart = float(np.max(other_motion.differential))
-        return TrackedTones(frame.time, fit, growth, measurements, findings, apart)
 
     def _predicted(self, state: _State) -> _State | None:
         """The state with predicted tones of the last frame; None if the frame must be measured.
@@ -535,7 +510,7 @@ class VibrationTracker:
     # Results
 
     def _result(self, prepared: PreparedFrames, state: _State, *, usable: bool = True) -> TrackedFrame:
-        """The result for the last frame."""
+        """The result for the last frame, moved to where the steady image is; the state is kept."""
         label: TrackingState = "searching" if usable else "unusable"
         device, measurements = prepared.images.device, None
         motion, path = Vibration.still(device=device), torch.full((2,), math.nan, dtype=torch.float64, device=device)
@@ -561,10 +536,14 @@ class VibrationTracker:
             motion = replace(motion.scaled(followed), amplitude=motion.amplitude * trusted[:, None])
             motion = motion.from_row_order(self.timing)
             label = "searching" if state.contradictions >= _PATIENCE else "tracking"
+        if usable and self.options.steady:
+            step = state.time - self._state.time
+            state = replace(state, live=state.live.steadied(state.time, table(path), step, self.options.steady))
+        self._state = state
         return TrackedFrame(
             time=state.time,
             state=label,
-            motion=motion,
+            motion=replace(motion, image_shift=tensor(state.live.shift).to(device)),
             path=path,
             detected=usable and state.untried == 0,
             measurements=measurements,

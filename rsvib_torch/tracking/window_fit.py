@@ -66,21 +66,6 @@ _SOFT = 3.0  # standard deviations, at which a corner has a quarter of the weigh
 
 
 @dataclass(frozen=True, eq=False)
-class SearchedFrequencies:
-    """Frequencies above those that a path follows, up to those that rows resolve."""
-
-    frequencies: Array  # (F,) Hz
-    step: float  # Hz, between them
-    is_resolved: NDArray[np.bool_]  # (F,), whether the exposure leaves a tone of this frequency
-    is_visible: NDArray[np.bool_]  # (F,), and whether it changes from frame to frame
-
-    @property
-    def limits(self) -> Array:
-        """Hz, the lowest and the highest frequency that is visible."""
-        return self.frequencies[self.is_visible][[0, -1]] if self.is_visible.any() else np.zeros(2)
-
-
-@dataclass(frozen=True, eq=False)
 class WindowPath:
     """Path and tones in one window of frames."""
 
@@ -93,11 +78,12 @@ class WindowPath:
     residual_of_most: float  # px, likewise; where the path is that of a layer, from four fifths of all corners
     # how the rows are read instead, if the corners contradict the stated readout, and px, median residuals by the path
     # with the stated and with this readout
-    other_readout: tuple[str, float, float] | None
+    other_readout: tuple[str, float, float] | None = None
     # part of the stated time of the readout, by which the path and the tones displace the rows; 0: as columns do
-    part: float
-    blur: tuple[float, float]  # ``blur_ratio``; 0 if it is unknown
-    agreeing: tuple[str, ...]  # other readouts that explain the corners as well, and the frequencies of their tones
+    part: float = 1.0
+    blur: tuple[float, float] = (0.0, 0.0)  # ``blur_ratio``; 0 if it is unknown
+    # other readouts that explain the corners as well, and the frequencies of their tones
+    agreeing: tuple[str, ...] = ()
 
     def path(self, times: Array, derivative: int = 0) -> Array:
         """(N, 4) components of the path, or their derivatives, at times (N,) in s."""
@@ -110,12 +96,6 @@ def _basis(index: NDArray[np.int64], factors: Array, count: int) -> Array:
     basis = np.zeros((*index.shape[:2], count))
     np.put_along_axis(basis, index, factors, -1)
     return basis
-
-
-def _differences(index: NDArray[np.int64], factors: Array, count: int) -> Array:
-    """(N, count), differences between both times (N, 2) of the B-splines from ``spline_taps``."""
-    basis = _basis(index, factors, count)
-    return np.asarray(basis[:, 1] - basis[:, 0])
 
 
 def _gain(frequency: Array | float, interval: float) -> Array:
@@ -195,7 +175,7 @@ class WindowFit:
         for begin, stop in pairwise((0, *ends)):
             part = slice(int(begin), int(stop))
             low, knots = int(index[part].min()), int(index[part].max()) + 1
-            basis = _differences(index[part] - low, weights[part], knots - low)
+            basis = np.diff(_basis(index[part] - low, weights[part], knots - low), axis=1)[:, 0]
             columns = np.einsum("nac,nk->anck", factors[part], basis).reshape(2, len(basis), -1)
             unknowns = (np.arange(4)[:, None] * self.count + np.arange(low, knots)).ravel()
             self.pairs.append((part, unknowns, columns))
@@ -292,14 +272,6 @@ class WindowFit:
             tone = WindowTone(axis, frequency, knots, self.start - self.origin, self.envelope_step, slope)
             self.tones.append(tone)
 
-    def with_tone(self, axis: int, frequency: float, slope: float) -> "WindowFit":
-        """The fit with one more tone."""
-        other = copy(self)
-        other.tones, other.weights = [*map(copy, self.tones)], self.layer.astype(np.float64)
-        other.add_tones([(axis, frequency)], slope)
-        other.solve(1)
-        return other
-
     def with_aliases(self, axis: int, frequency: float, slope: float, limits: Array) -> list["WindowFit"]:
         """The fit with a tone or one of its aliases between ``limits`` in Hz, the best first.
 
@@ -308,7 +280,12 @@ class WindowFit:
         """
         aliases = frequency + np.arange(-_ALIASES, _ALIASES + 1) / self.interval
         inside = (aliases > limits[0]) & (aliases < limits[1]) & self.is_apart(axis, aliases)
-        trials = [self.with_tone(axis, alias, slope) for alias in aliases[inside | (aliases == frequency)].tolist()]
+        trials = list[WindowFit]()
+        for alias in aliases[inside | (aliases == frequency)].tolist():
+            trials.append(trial := copy(self))
+            trial.tones, trial.weights = [*map(copy, self.tones)], self.layer.astype(np.float64)
+            trial.add_tones([(axis, alias)], slope)
+            trial.solve(1)
         return sorted(trials, key=lambda trial: trial.unexplained)
 
     def with_distinct_tones(self, limits: Array) -> "WindowFit | None":
@@ -389,46 +366,38 @@ class WindowFit:
                     largest = max(largest, abs(float(triangle[5, 6] / triangle[5, 5])))
         return largest
 
-    def path(
-        self,
-        other_readout: tuple[str, float, float] | None = None,
-        *,
-        part: float = 1.0,
-        blur: tuple[float, float] = (0.0, 0.0),
-        agreeing: tuple[str, ...] = (),
-    ) -> WindowPath:
-        """The result of the fit; the arguments are those of ``WindowPath``."""
+    def path(self) -> WindowPath:
+        """The result of the fit."""
         knots = self.knots.T / np.array([1.0, 1.0, self.reach, self.reach])
         residual = residual_of_most = float(np.median(self.distance)) / _HALF
         if not self.layer.all():  # with a subject on 40 % of the frame, tones of 0.1 px were found that are none
             residual_of_most = float(np.quantile(self.distance, 0.8)) / _FOUR_FIFTHS
-        of_window, of_fit = (self.origin, self.start, self.step, knots, tuple(self.tones)), (residual, residual_of_most)
-        return WindowPath(*of_window, *of_fit, other_readout, part, blur, agreeing)
-
-    def is_apart_from(self, frequency: float, others: Array) -> NDArray[np.bool_]:
-        """Whether other frequencies are not those of a tone, nor of a change of its amplitude."""
-        resolved = max(2.0 / (self.times.max() - self.times.min()), 0.5 / self.envelope_step)
-        return np.asarray(np.abs(others - frequency) > resolved)
+        tones = tuple(self.tones)
+        return WindowPath(self.origin, self.start, self.step, knots, tones, residual, residual_of_most)
 
     def is_apart(self, axis: int, frequencies: Array) -> NDArray[np.bool_]:
-        """Whether frequencies are those of none of the tones of an axis."""
-        tones = (tone for tone in self.tones if tone.axis == axis)
-        return np.all([frequencies > 0, *(self.is_apart_from(tone.frequency, frequencies) for tone in tones)], axis=0)
+        """Whether frequencies are those of none of the tones of an axis, nor of a change of their amplitudes."""
+        resolved = max(2.0 / (self.times.max() - self.times.min()), 0.5 / self.envelope_step)
+        tones = np.array([tone.frequency for tone in self.tones if tone.axis == axis])
+        return np.asarray((frequencies > 0) & (np.abs(frequencies[:, None] - tones) > resolved).all(1))
 
-    def searched(self, readout: float) -> SearchedFrequencies:
-        """The frequencies of tones that are searched for, with the time of a readout in s."""
+    def searched(self, readout: float) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
+        """Frequencies (F,) in Hz above those that a path follows, up to those that rows resolve in a ``readout`` in s.
+
+        Also whether the exposure leaves a tone of a frequency (F,), and whether it changes from frame to frame (F,).
+        """
         step = 0.3 / (self.times.max() - self.times.min())
         frequencies = np.arange(_LOWEST / self.interval, min(0.5 * _CELLS / readout, _HIGHEST), step)
         is_resolved = np.abs(np.prod(np.sinc(frequencies[:, None] * np.array(self.averaged)), 1)) > _MIN_SINC
         is_visible = is_resolved & (_gain(frequencies, self.interval) > _MIN_GAIN)
-        return SearchedFrequencies(frequencies, step, is_resolved, is_visible)
+        return frequencies, is_resolved, is_visible
 
     def strongest(
-        self, axis: int, grid: SearchedFrequencies, wanted: NDArray[np.bool_], *, slope: float = 0.0, turns: float = 0.0
+        self, axis: int, frequencies: Array, wanted: NDArray[np.bool_], *, slope: float = 0.0, turns: float = 0.0
     ) -> tuple[float, float, float]:
         """The frequency that explains most of an axis, its ratio of variances, and the offsets by it (px rms).
 
-        It is one of those ``wanted`` of a grid of frequencies, all of which change by ``slope`` in Hz/s, and whose
+        It is one of those ``wanted`` of evenly spaced frequencies, all of which change by ``slope`` in Hz/s, and whose
         phase advances by further ``turns`` from the first to the last row, but not from frame to frame.
         """
         # 1. Means of the offsets along the axis in cells of rows, without those by the other components.
@@ -447,7 +416,8 @@ class WindowFit:
         early, late, rest = (np.bincount(cell, weights * values) / total for values in (*self.times.T, offsets))
         times, root = np.stack([early, late], -1), np.sqrt(total)
         # 2. Project out what the path and the tones so far explain.
-        basis = _differences(*spline_taps(times + self.origin, self.start, self.step, self.count), self.count)
+        taps = spline_taps(times + self.origin, self.start, self.step, self.count)
+        basis = np.diff(_basis(*taps, self.count), axis=1)[:, 0]
         values = _basis(*self.envelope(times), self.envelope_knots)
         tones = [wave_columns(tone.waves(times, self.averaged), values) for tone in self.tones if tone.axis == axis]
         known = np.concatenate([basis, *tones], 1) * root[:, None]
@@ -460,10 +430,9 @@ class WindowFit:
         rest = rest - known @ cho_solve(factor, known.T @ rest)
         before = float(rest @ rest)
         half = solve_triangular(factor[0], known.T, lower=True).astype(np.float32)
-        frequencies = grid.frequencies
         # 3. What a tone of each frequency explains of the rest: the fit of a cosine and a sine. Waves are products of
         # those of a coarse and a fine grid of frequencies, in a tenth of the time of sines and cosines.
-        fine = np.exp(2j * math.pi * grid.step * np.arange(_FINE)[:, None, None] * times.T)
+        fine = np.exp(2j * math.pi * (frequencies[1] - frequencies[0]) * np.arange(_FINE)[:, None, None] * times.T)
         fine, single_rest, parts = fine.astype(np.complex64), rest.astype(np.float32), []
         of_rows = np.bincount(cell, weights * self.corners.rows) / total
         swept = root * np.exp(1j * math.pi * (slope * times.T**2 + 2 * turns * of_rows))
@@ -495,19 +464,6 @@ def averaging(exposure: float, row_time: float, size: tuple[int, int]) -> Averag
     return exposure, _PATCH_ROWS * reduction(*size) * row_time
 
 
-def distances_left(
-    corners: Corners, interval: float, averaged: Averaged, tones: Sequence[tuple[int, float]] = ()
-) -> Array:
-    """(N,) px, what a path and tones of given axes and frequencies (Hz) leave of the offsets of corners.
-
-    Other arguments are as in ``fit_window``.
-    """
-    fit = WindowFit(corners, interval, averaged)
-    fit.add_tones(tones)
-    fit.solve(ROUNDS)
-    return fit.distance
-
-
 def fit_window(
     corners: Corners,
     interval: float,
@@ -524,28 +480,30 @@ def fit_window(
     fit = WindowFit(corners, interval, averaged)
     fit.solve(ROUNDS)
     fit = fit.of_layer()
-    grid = fit.searched(readout)
-    axes = [0, 1] if has_tones and grid.is_visible.sum() > 2 else []
+    frequencies, is_resolved, is_visible = fit.searched(readout)
+    limits = frequencies[is_visible][[0, -1]] if is_visible.any() else np.zeros(2)  # Hz
+    axes = [0, 1] if has_tones and is_visible.sum() > 2 else []
     # Strongest tones by axis and slope. A tone of one axis does not change those of the other.
     found: dict[tuple[int, float], tuple[float, float, float]] = {}
-    left_out = np.zeros((2, len(grid.frequencies)), bool)
+    left_out = np.zeros((2, len(frequencies)), bool)
     while axes:
         for axis, slope in ((axis, float(slope)) for axis in axes for slope in slopes):
             if (axis, slope) not in found:
-                wanted = grid.is_resolved if abs(slope) > _FAST else grid.is_visible
-                wanted = wanted & fit.is_apart(axis, grid.frequencies) & ~left_out[axis]
-                found[axis, slope] = fit.strongest(axis, grid, wanted, slope=slope)
+                wanted = is_resolved if abs(slope) > _FAST else is_visible
+                wanted = wanted & fit.is_apart(axis, frequencies) & ~left_out[axis]
+                found[axis, slope] = fit.strongest(axis, frequencies, wanted, slope=slope)
         (axis, slope), (frequency, ratio, offsets) = max(found.items(), key=lambda item: item[1][1])
         if ratio < MIN_RATIO or offsets < _MIN_EXPLAINED:
             break
-        best, *_ = fit.with_aliases(axis, frequency, slope, grid.limits)
+        best, *_ = fit.with_aliases(axis, frequency, slope, limits)
         found = {of: value for of, value in found.items() if of[0] != axis}
         best.solve()
         if best.has_blind_tone():
             # A part of the picture that moves by itself displaces the same rows again and again: without vibration, it
             # became tones of up to 70 px at the frame rate.
             blind = round(frequency * interval) / interval
-            left_out[axis] |= np.abs(grid.frequencies - blind) <= abs(frequency - blind) + grid.step
+            step = frequencies[1] - frequencies[0]
+            left_out[axis] |= np.abs(frequencies - blind) <= abs(frequency - blind) + step
             continue
         fit = best
         axes = [axis for axis in (0, 1) if sum(one.axis == axis for one in fit.tones) < _MOST_TONES]
@@ -557,7 +515,7 @@ def fit_window(
         number = len(fit.tones)
         fit.solve()
         fit.keep_tones()
-        changed = fit.with_distinct_tones(grid.limits)
+        changed = fit.with_distinct_tones(limits)
         if changed is not None:
             fit, number = changed, -1
     return fit

@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
 
@@ -31,33 +31,20 @@ _CUT, _THUMBNAIL, _FEW = 0.8, (16, 16), 64
 class FirstPass:
     """Follows corners from each usable frame of a video to the next one; copies of the frame before do not count."""
 
-    def __init__(
-        self,
-        frames: VideoFrames,
-        decoded: Generator[Frame | str, None, None],
-        starts: list[float],
-        times: Array,
-        *,
-        for_gyroscope: bool,
-        stabilised: bool,
-    ) -> None:
-        """A pass through the ``decoded`` frames of a video, whose exposures start at ``starts`` in s.
-
-        Their middles are at ``times`` (N,) in s. The camera may have ``stabilised`` its images.
-        """
-        self._frames, self._decoded, self._starts, self._times = frames, decoded, starts, times
-        self._timing, self._for_gyroscope, self._stabilised = frames.job.timing, for_gyroscope, stabilised
-        self.taken = times.copy()  # of copies, when the frame before was taken
+    def __init__(self, frames: VideoFrames, *, for_gyroscope: bool) -> None:
+        self._frames, self._timing, self._for_gyroscope = frames, frames.job.timing, for_gyroscope
+        self._times = frames.middles
+        self.taken = frames.middles  # (N,) s, middle of every frame, and of copies that of the frame before
         self.faults: dict[int, str] = {}  # number of each frame that cannot be used, with the reason
         self.corners: dict[int, Corners] = {}  # between a frame and the next one, of the first frames of each part
         self.compared: dict[int, Corners] = {}  # with a gyroscope, likewise, of some frames of the video
         self.repetitions: dict[int, Array | None] = {}  # without a gyroscope, of each part
-        self._chosen = compared_pairs(len(times)) if for_gyroscope else []
+        self._chosen = compared_pairs(len(frames.starts)) if for_gyroscope else []
         self._others: set[int] = set()  # frames that show something else than the frame before
         self._before: tuple[int, NDArray[np.uint8]] | None = None  # the usable frame before, and its number
         self._changes: deque[float] = deque(maxlen=_MEMORY)  # counts, of the frames before
         self._waiting: list[tuple[int, NDArray[np.uint8], float]] = []  # possible copies of it, and their changes
-        self._follower = CornerFollower(self._timing, compare_blur=not for_gyroscope and not stabilised)
+        self._follower = CornerFollower(self._timing, compare_blur=not for_gyroscope and not frames.stabilised)
 
     @property
     def cuts(self) -> list[int]:
@@ -66,15 +53,12 @@ class FirstPass:
 
     def pairs(self, progress: Callable[[], None]) -> Iterator[Corners | None]:
         """Corners between each usable frame and the one before; a thread follows them, up to a window ahead."""
-        with closing(prefetched(self._followed(), WINDOW_FRAMES)) as frames:
-            for corners in frames:
-                progress()
-                yield from corners
-
-    def _followed(self) -> Generator[tuple[Corners | None, ...], None, None]:
-        with closing(self._decoded) as frames:
-            for index, frame in enumerate(frames):
-                yield self._next(index, frame)
+        with closing(self._frames.decoded()) as frames:
+            known = (self._next(index, frame) for index, frame in enumerate(frames))
+            with closing(prefetched(known, WINDOW_FRAMES)) as followed:
+                for corners in followed:
+                    progress()
+                    yield from corners
 
     def _next(self, index: int, frame: Frame | str) -> tuple[Corners | None, ...]:
         """The corners between usable frames that are known with a frame."""
@@ -102,7 +86,7 @@ class FirstPass:
             return ()
         if not self._for_gyroscope and index // PART_FRAMES not in self.repetitions:
             self.repetitions[index // PART_FRAMES] = repetition(grey)
-        corners = self._follower.next(grey, self._starts[index])
+        corners = self._follower.next(grey, float(self._frames.starts[index]))
         self._before = index, grey
         if before is None:
             return ()
@@ -114,9 +98,9 @@ class FirstPass:
             if corners is not None and index % PART_FRAMES < CHECKED_FRAMES:
                 self.corners[index - 1] = corners
             if index - 1 in self._chosen:
-                starts = self._starts[index - 1 : index + 1]
+                starts = self._frames.starts[index - 1 : index + 1].tolist()
                 self.compared[index - 1] = followed_pair(before[1], grey, starts, self._timing)
-        if corners is not None and self._stabilised:
+        if corners is not None and self._frames.stabilised:
             both = np.broadcast_to(self.taken[[before[0], index]], corners.times.shape)
             corners = replace(corners, times=both)
         return (corners,)

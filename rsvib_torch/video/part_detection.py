@@ -20,7 +20,7 @@ from rsvib_torch.text import number_of
 from rsvib_torch.tracking.camera_path import CameraPath
 from rsvib_torch.tracking.window_fit import SIGNIFICANT, WindowPath
 from rsvib_torch.tracking.window_tones import Tone, WindowTone
-from rsvib_torch.video.video_frames import FrameTrack, VideoFrames
+from rsvib_torch.video.video_frames import VideoFrames
 
 _GAIN_ERROR = 0.02  # of an amplitude: the mean over the patch of a corner is known so well (52 to 205 Hz: 0.4 to 1.6 %)
 # px^-2, of the third cumulant of the path within an exposure, by which a blurred corner is found beside the mean of the
@@ -34,14 +34,15 @@ _MAX_APART = 0.25  # of a tone, left in a third of the rows or columns: up to 0.
 _MAX_COPIES = 0.05  # of the frames; with more, frames were taken at other times than stored: 143 Hz became 149 Hz
 
 
-def part_detection(frames: VideoFrames, path: CameraPath, times: Array, tracks: list[FrameTrack]) -> DetectedVibration:
+def part_detection(frames: VideoFrames, path: CameraPath, times: Array, part: slice) -> DetectedVibration:
     """The vibration in the middle of a part; its time origin is the start of the first frame of the part.
 
     ``times`` (N,) in s are the middles of all frames of the video.
     """
-    middle = float(times[tracks[len(tracks) // 2].index])
+    of_part, begin = times[part], float(frames.starts[part.start])
+    middle = float(of_part[len(of_part) // 2])
     window = path.nearest(middle)
-    tones = [tone.at(middle - window.origin, tracks[0].time - window.origin) for tone in window.tones]
+    tones = [tone.at(middle - window.origin, begin - window.origin) for tone in window.tones]
     amplitude, frequency, phase, size, rate = tone_tables(tones, 2)
     apparent, amplitude = amplitude, _without_blur(frames, amplitude, frequency)
     size = np.hypot(size, _GAIN_ERROR * apparent)
@@ -51,8 +52,7 @@ def part_detection(frames: VideoFrames, path: CameraPath, times: Array, tracks: 
     size = np.hypot(size, 0.5 * (apparent - amplitude))  # blur does not turn the phase
     unknown = np.full(2, math.inf)
     values = (size, rate, period_std, phase_std, unknown, unknown)
-    begin = times[[tracks[0].index]]
-    velocity, acceleration = (window.path(begin, order)[0, :2] for order in (1, 2))
+    velocity, acceleration = (window.path(of_part[:1], order)[0, :2] for order in (1, 2))
     vibration = Vibration(amplitude, frequency, phase, velocity, acceleration)
     findings = _findings(frames.job.timing, tones, window)
     copies = np.count_nonzero(np.diff(times) <= 0) / len(times)
@@ -81,7 +81,7 @@ def part_detection(frames: VideoFrames, path: CameraPath, times: Array, tracks: 
         centre=np.zeros(1),
     )
     rows = frames.size[int(timing.scan_axis)]
-    sensitivity = timing_sensitivity(fit, timing.in_row_order(), len(tracks), rows)[0]
+    sensitivity = timing_sensitivity(fit, timing.in_row_order(), len(of_part), rows)[0]
     return DetectedVibration(
         vibration=vibration,
         std=with_row_time_std(std, vibration, sensitivity, timing),

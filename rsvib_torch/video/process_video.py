@@ -15,7 +15,6 @@ from rsvib_torch.execution.parallel import in_threads
 from rsvib_torch.files.atomic import whole_file
 from rsvib_torch.frames.entry_points import file_options
 from rsvib_torch.gyroscope.gpmf_track import read_camera_track
-from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
 from rsvib_torch.gyroscope.read_gyroscope import read_gyroscope
 from rsvib_torch.gyroscope.rotation_alignment import RotationAlignment
 from rsvib_torch.io.stack_info import StackInfo, split_range
@@ -24,6 +23,7 @@ from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, s
 from rsvib_torch.io.video import CONTAINERS, VideoReader, join_parts, part_of_video
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.numerics.tables import table
 from rsvib_torch.options import ProcessVideoOptions, ResourceOptions, StackOptions
 from rsvib_torch.results.presentation import plain_values
 from rsvib_torch.stacks.job import plan_job
@@ -33,7 +33,7 @@ from rsvib_torch.stacks.run_folder import FileRun, RunFolder, StackReport
 from rsvib_torch.video import Margins
 from rsvib_torch.video.first_pass import PART_FRAMES
 from rsvib_torch.video.video_frames import Frame, FrameTrack, VideoFrames
-from rsvib_torch.video.video_passes import VideoMotion, VideoPasses, shakes_more
+from rsvib_torch.video.video_passes import VideoMotion, left_alone, shakes_more, video_motion
 
 _TOGETHER = ("joint", "scale", "mosaic", "optics")  # options of restore that frames one by one do not have
 _JUDGED_FRAMES = 4  # of each part, whose shaking decides whether it is restored
@@ -99,8 +99,9 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
     rates = None if recording is None else read_gyroscope(recording)
     if rates is None and options.lens_profile is not None:
         raise ValueError("lens_profile belongs to a gyroscope: give gyroscope as well")
-    video, at_once = _planned(source, sink, timing, options, rates)
-    job = video.frames.job
+    frames, at_once = _planned(source, sink, timing, options)
+    job, profile = frames.job, options.lens_profile
+    camera = None if profile is None else Camera.from_gyroflow(profile, frames.size[1], frames.size[0])
     if sink.suffix.lower() not in CONTAINERS:
         raise ValueError(f"{sink}: videos are written to {', '.join(CONTAINERS)}")
     content = job.content(job.info, timing)
@@ -114,13 +115,13 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
             "steady": options.steady,
             "crop_limit": options.crop_limit,
             "gyroscope": None if recording is None else fingerprint(recording),
-            "camera": video.camera and asdict(video.camera),
-            "stabilised": video.stabilised,
-            "exposures": None if video.exposures is None else [min(video.exposures), max(video.exposures)],
+            "camera": camera and asdict(camera),
+            "stabilised": frames.stabilised,
+            "exposures": None if frames.exposures is None else np.sort(frames.exposures)[[0, -1]].tolist(),
         },
     }
 
-    inputs = [*stack_files(source), *(Path(file) for file in (recording, options.lens_profile) if file is not None)]
+    inputs = [*stack_files(source), *(Path(file) for file in (recording, profile) if file is not None)]
     run = FileRun(sink, options, header, inputs)
     finished = run.finished()
     if finished is not None:
@@ -131,18 +132,19 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
 
         def progress() -> None:
             if options.progress is not None:
-                options.progress(next(done) // 2, len(video.starts))
+                options.progress(next(done) // 2, len(frames.starts))
 
         if options.progress is not None:
-            options.progress(0, len(video.starts))
-        motion = video.motion(progress)
-        margins = video.margins(motion) if border == "crop" else None
+            options.progress(0, len(frames.starts))
+        motion = video_motion(frames, options, rates, camera, progress)
+        margins = motion.margins() if border == "crop" else None
         if margins is not None:
             kept = margins.cut(torch.empty(content.shape[-2:], device="meta")).shape
             content = replace(content, shape=(*content.shape[:-2], *kept))
         check_info_target(sink, content, check_folder=False)
-        _SecondPass(video, motion, folder, content, margins, progress).run(at_once)
-        _check_shaking(folder, is_explained=any(video.is_explained(motion, part) for part in range(video.parts)))
+        _SecondPass(motion, folder, content, margins, progress).run(at_once)
+        parts = range(-(-len(frames.starts) // PART_FRAMES))
+        _check_shaking(folder, is_explained=any(map(motion.is_explained, parts)))
         gyroscope = None
         if isinstance(motion.path, RotationAlignment):
             gyroscope = {name: plain_values(getattr(motion.path, name)) for name in _OF_GYROSCOPE}
@@ -176,9 +178,7 @@ def _check_shaking(folder: RunFolder, *, is_explained: bool) -> None:
             )
 
 
-def _planned(
-    source: Path, sink: Path, timing: SensorTiming, options: ProcessVideoOptions, rates: AngularRates | None
-) -> tuple[VideoPasses, int]:
+def _planned(source: Path, sink: Path, timing: SensorTiming, options: ProcessVideoOptions) -> tuple[VideoFrames, int]:
     """The job of a run with the layout of its frames, and the number of frames to restore at the same time."""
     given = options.restoration or {}
     for name in _TOGETHER:
@@ -190,14 +190,13 @@ def _planned(
     with closing(open_stack(source)) as reader:
         stored = reader.picture if isinstance(reader, VideoReader) else None
     picture = stored if stored is not None and stored.fits(sink.suffix.lower()) else None
-    frames = VideoFrames(job, picture)
     if job.info.shape[0] < 3:
         raise ValueError(
             f"{source}: to be followed, a video needs at least 3 frames, it has {job.info.shape[0]}; use process_stack "
             "(rsvib run without --video)"
         )
-    times = job.timing.frame_starts(job.info.shape[0]).tolist()
-    starts = np.array(times) - times[0]
+    starts = table(job.timing.frame_starts(job.info.shape[0]))
+    starts = starts - starts[0]
     # What the track of a GoPro video states of its frames. Rows are read at equal intervals, where exposures end:
     # frames of a longer exposure are exposed earlier in the mean.
     whole, part = split_range(source)
@@ -207,18 +206,13 @@ def _planned(
         exposures = track.exposures_at(starts + begin)
         starts = starts - 0.5 * (exposures - job.timing.exposure_time)
         starts = starts - starts[0]
-    stabilised = track is not None and track.stabilised
-    stated = None if exposures is None else exposures.tolist()
-    profile, (height, width) = options.lens_profile, frames.size
-    camera = None if profile is None else Camera.from_gyroflow(profile, width, height)
-    return VideoPasses(frames, options, starts.tolist(), rates, camera, stated, stabilised), at_once
+    return VideoFrames(job, picture, starts, exposures, track is not None and track.stabilised), at_once
 
 
 @dataclass(frozen=True, eq=False)
 class _SecondPass:
     """Restores the parts of a video that are not in the folder, and encodes them there."""
 
-    video: VideoPasses
     motion: VideoMotion
     folder: RunFolder
     info: StackInfo  # of the video to write
@@ -229,33 +223,33 @@ class _SecondPass:
     def run(self, at_once: int) -> None:
         """Restore a number of frames at the same time."""
         share_one_heap()
-        threads = 1 if self.video.frames.job.options.device == "cpu" else torch.get_num_threads()
+        threads = 1 if self.motion.frames.job.options.device == "cpu" else torch.get_num_threads()
         with closing(in_threads(self._restored, self._missing(), at_once=at_once, threads=threads)) as frames:
             for part, of_part in groupby(frames, lambda one: one[0].index // PART_FRAMES):
                 self._encode(part, of_part)
 
     def _missing(self) -> Generator[tuple[FrameTrack, Frame | str], None, None]:
         """The frames to restore, with what is removed from them."""
-        video, motion = self.video, self.motion
-        with closing(video.decoded()) as decoded:
+        motion = self.motion
+        with closing(motion.frames.decoded()) as decoded:
             for part, frames in groupby(enumerate(decoded), lambda one: one[0] // PART_FRAMES):
                 if part in self.folder:
                     for _ in frames:
                         self.progress()
                     continue
-                tracked = ((video.track(motion, index), frame) for index, frame in frames)
+                tracked = ((motion.track(index), frame) for index, frame in frames)
                 first = list(islice(tracked, _JUDGED_FRAMES))
-                if video.is_worse(motion, part, [track for track, _ in first]):
+                if motion.is_worse(part, [track for track, _ in first]):
                     self.worse.add(part)
                 for track, frame in chain(first, tracked):
-                    yield video.left_alone(track) if part in self.worse else track, frame
+                    yield left_alone(track) if part in self.worse else track, frame
 
     def _restored(self, track: FrameTrack, frame: Frame | str) -> _Restored:
-        return track, None if isinstance(frame, str) else self.video.frames.restored(frame, track)
+        return track, None if isinstance(frame, str) else self.motion.frames.restored(frame, track)
 
     def _encode(self, part: int, frames: Iterator[_Restored]) -> None:
         """Encode the frames of a part, and enter it in the folder."""
-        layout, folder = self.video.frames, self.folder
+        layout, folder = self.motion.frames, self.folder
         name = f"{part:06d}{folder.sink.suffix.lower()}"
         tracks: list[FrameTrack] = []
         shown: Frame | None = None  # the last frame that could be used
@@ -273,7 +267,7 @@ class _SecondPass:
             if shown is None:
                 for _ in tracks:
                     write(layout.frame(_cut(layout.black(), self.margins)))
-        folder.add(self.video.record(part, tracks, self.motion, is_worse=part in self.worse), [name])
+        folder.add(self.motion.record(part, tracks, is_worse=part in self.worse), [name])
         self.progress()
 
 

@@ -4,6 +4,8 @@ Invariant: the displacement depends on the row only (docs/architecture.md); with
 column.
 """
 
+from collections.abc import Generator
+from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -15,19 +17,21 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import conv1d, embedding_bag
 
-from rsvib_torch.execution.parallel import chunks
+from rsvib_torch.execution.parallel import chunks, prefetched
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.imaging.trajectory import places, recorded_offsets
 from rsvib_torch.io.full_scale import counts_to_frames, frames_to_counts
-from rsvib_torch.io.video import Picture
+from rsvib_torch.io.video import Picture, VideoReader
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.numerics.interpolation import mirrored
 from rsvib_torch.numerics.tables import Array
+from rsvib_torch.registration.corners import eight_bits
 from rsvib_torch.restoration.restore import WITH_SATURATION, restore_prepared
-from rsvib_torch.stacks.job import StackJob
+from rsvib_torch.stacks.job import StackJob, stored_frame
 
+_AHEAD = 4  # frames decoded before they are used
 _LOBES = 4  # of the kernel of Lanczos on each side
 # of pixels, or of Y and chroma: Y has 44.8 dB with Lanczos and 44.5 dB with the cubic kernel, chroma 46.9 and 47.0 dB
 _KERNELS = cv2.INTER_LANCZOS4, cv2.INTER_CUBIC
@@ -40,10 +44,8 @@ class FrameTrack:
     """What is removed from a frame of a video."""
 
     index: int  # number of the frame
-    time: float  # s, exposure start of its first row, from the first frame
     motion: Vibration | FreeMotion  # the motion to remove, in image axes; its time origin is the middle of the frame
     fault: str | None = None  # why the frame could not be used; None if it was used
-    exposure: float | None = None  # s, of this frame; None: that of the sensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,11 +58,19 @@ class VideoFrames:
 
     job: StackJob  # source and settings
     picture: Picture | None  # if frames are the planes Y, U and V of a 4:2:0 video (``VideoReader.planes``)
+    starts: Array  # (N,) s, exposure start of every frame, from the first one
+    exposures: Array | None  # (N,) s, of the frames; None: all that of the sensor
+    stabilised: bool  # by the camera: frames move as a whole, without rows that are read one after another
 
-    @property
-    def planar(self) -> bool:
-        """Whether a frame is the planes of a video instead of pixels."""
-        return self.picture is not None
+    def decoded(self) -> Generator[Frame | str, None, None]:
+        """Every frame, or why it cannot be read; decoded ahead in a thread."""
+        return prefetched(self._decoded(), _AHEAD)
+
+    def _decoded(self) -> Generator[Frame | str, None, None]:
+        with closing(self.job.open()) as reader:
+            read = reader.planes if self.picture is not None and isinstance(reader, VideoReader) else reader.frame
+            for index in range(len(self.starts)):
+                yield stored_frame(read, index)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -68,9 +78,9 @@ class VideoFrames:
         return self.job.info.shape[-2], self.job.info.shape[-1]
 
     @property
-    def full_scale(self) -> float | None:
-        """Count that corresponds to 1.0; None for floats."""
-        return self.job.options.full_scale if self.picture is None else 255.0
+    def middles(self) -> Array:
+        """(N,) s, middle of every frame by the timing of the sensor."""
+        return self.starts + self.job.timing.time_to_middle(self.size[int(self.job.timing.scan_axis)])
 
     def grey(self, frame: Frame) -> NDArray[np.uint8]:
         """The frame as 8-bit counts (H, W), in which corners are followed."""
@@ -78,24 +88,24 @@ class VideoFrames:
         luma = luma if luma.ndim == 2 else luma.mean(0)
         if luma.dtype == np.uint8:
             return luma.astype(np.uint8, copy=False)
-        low, high = np.nanpercentile(luma[::4, ::4], (0.1, 99.9))  # the full scale may be far beyond the content
-        counts: NDArray[np.float64] = (np.nan_to_num(luma, nan=low) - low) * (255.0 / max(high - low, 1e-30))
-        return counts.round().clip(0, 255).astype(np.uint8)
+        levels = np.nanpercentile(luma[::4, ::4], (0.1, 99.9))  # the full scale may be far beyond the content
+        return eight_bits(np.nan_to_num(luma, nan=levels[0]), levels)
 
     def planes(self, frame: Frame) -> list[Frame]:
         """Planes (..., H, W): all pixels, or Y (H, W) and the chroma (2, H / 2, W / 2)."""
-        if not self.planar:
+        if self.picture is None:
             return [frame]
         height, width = self.size
         return [frame[:height], frame[height:].reshape(2, height // 2, width // 2)]
 
     def frame(self, planes: list[Frame]) -> Frame:
         """The frame with these planes."""
-        return np.concatenate([planes[0], planes[1].reshape(-1, planes[0].shape[1])]) if self.planar else planes[0]
+        luma, *chroma = planes
+        return np.concatenate([luma, *(plane.reshape(-1, luma.shape[1]) for plane in chroma)]) if chroma else luma
 
     def black(self) -> list[Frame]:
         """Planes of a frame without content."""
-        if not self.planar:
+        if self.picture is None:
             return [np.zeros(self.job.info.shape[1:], self.job.info.dtype)]
         height, width = self.size
         return [np.full((height, width), 16, np.uint8), np.full((2, height // 2, width // 2), 128, np.uint8)]
@@ -108,7 +118,7 @@ class VideoFrames:
         results: list[Frame] = []
         for number, plane in enumerate(planes):
             motion = track.motion if number == 0 else _on_half_pixels(track.motion)
-            timing = self.timing_of(number, track.exposure)
+            timing = self.timing_of(number, track.index)
             separately = number == 0 and method != "dewarp"
             if separately and isinstance(motion, Vibration) and bool((motion.amplitude > 0).any()):
                 # The method undoes what varies between the rows along x and y, and the rest is moved afterwards.
@@ -126,12 +136,13 @@ class VideoFrames:
                 results.append(_with_pixels_moved(plane, source, _KERNELS[number]))
         return results
 
-    def timing_of(self, plane: int, exposure: float | None = None) -> SensorTiming:
-        """Timing of one frame, with the time origin in its middle; rows of chroma lie between two of luma."""
+    def timing_of(self, plane: int, index: int) -> SensorTiming:
+        """Timing of a plane of a frame, with the time origin in its middle; rows of chroma lie between two of luma."""
         timing = self.job.timing
-        if exposure is not None:
-            timing = replace(timing, exposure_rows=min(exposure / timing.row_time, timing.frame_rows))
-        half = timing.time_to_middle(self.size[int(timing.scan_axis)])
+        if self.exposures is not None:
+            rows = float(self.exposures[index]) / timing.row_time
+            timing = replace(timing, exposure_rows=min(rows, timing.frame_rows))
+        half = timing.time_to_middle(self.size[int(timing.scan_axis)])  # of this frame
         if plane == 0:
             return replace(timing, frame_start_times=(-half,))
         return replace(
@@ -143,7 +154,7 @@ class VideoFrames:
         )
 
     def _without_vibration(self, plane: Frame, timing: SensorTiming, motion: Vibration) -> Frame:
-        scale, options = self.full_scale, self.job.chosen
+        scale, options = self.job.options.full_scale if self.picture is None else 255.0, self.job.chosen
         images: Tensor = counts_to_frames(plane[None], scale, "the video").to(self.job.options.device)
         saturation = options.saturation if isinstance(options.saturation, float) else None
         if saturation is not None and self.picture is not None:

@@ -1,19 +1,17 @@
-"""Passes through a video: the motion of all frames, where they are moved to, verdict and record of the parts."""
+"""The motion of all frames of a video, where they are moved to, verdict and record of its parts."""
 
 import math
-from collections.abc import Callable, Generator, Sequence
-from contextlib import closing
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
-from rsvib_torch.execution.parallel import ONE_BLAS_THREAD, prefetched
+from rsvib_torch.execution.parallel import ONE_BLAS_THREAD
 from rsvib_torch.gyroscope.corner_tracks import tracks_of_pairs
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
 from rsvib_torch.gyroscope.rotation_alignment import AlignOptions, RotationAlignment, align_rates
 from rsvib_torch.imaging.trajectory import places_at_rest, recorded_offsets
-from rsvib_torch.io.video import VideoReader
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.vibration import Vibration
@@ -22,18 +20,15 @@ from rsvib_torch.options import ProcessVideoOptions
 from rsvib_torch.registration.corners import Corners
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
-from rsvib_torch.stacks.job import stored_frame
 from rsvib_torch.stacks.windows import WindowRecord
 from rsvib_torch.tracking.camera_path import CameraPath, camera_path, shake
-from rsvib_torch.tracking.window_tones import Tone
 from rsvib_torch.video import Margins
 from rsvib_torch.video.first_pass import CHECKED_FRAMES, PART_FRAMES, FirstPass
 from rsvib_torch.video.part_detection import part_detection, tone_tables
 from rsvib_torch.video.recorded_rotation import RecordedRotation
 from rsvib_torch.video.steadying import steady_shifts
-from rsvib_torch.video.video_frames import Frame, FrameTrack, VideoFrames
+from rsvib_torch.video.video_frames import FrameTrack, VideoFrames
 
-_AHEAD = 4  # frames decoded before they are used
 # Of the distance at which a scene repeats itself, a step from frame to frame, along it, up to which the part of the
 # video shows by how much the frames move; a larger one may be another by the whole distance
 _MOST_OF_REPETITION = 0.25
@@ -44,144 +39,33 @@ _SMALLEST = 0.02  # px at the corners; roll and zoom below are left out, because
 
 @dataclass(frozen=True, eq=False)
 class VideoMotion:
-    """The motion of all frames of a video."""
-
-    path: CameraPath | RotationAlignment  # of the camera, from corners or by a gyroscope
-    times: Array  # (N,) s, middle of every frame, and of copies that of the frame before
-    removed: Callable[[int], Vibration | FreeMotion]  # from a frame, the middle of which is the time origin
-    faults: dict[int, str]  # number of each frame that could not be used, with the reason
-    corners: dict[int, Corners]  # between the frame of this number and the next one, of the first ones of each part
-
-
-@dataclass(frozen=True, eq=False)
-class VideoPasses:
-    """What the passes through a video have in common: how frames are read, moved, judged and recorded."""
+    """The motion of all frames of a video: what is removed, where frames are moved to, verdict and record of parts."""
 
     frames: VideoFrames  # source, settings, and how frames are restored
-    options: ProcessVideoOptions
-    starts: list[float]  # s, exposure start of every frame, from the first one
-    rates: AngularRates | None  # of a gyroscope, whose rotation is the path
-    camera: Camera | None  # whose lens is known; None: its focal length is fitted
-    exposures: list[float] | None  # s, of the frames; None: all that of the sensor
-    stabilised: bool  # by the camera: frames move as a whole, without rows that are read one after another
+    path: CameraPath | RotationAlignment  # of the camera, from corners or by a gyroscope
+    found: FirstPass  # times, faults and corners of the frames
+    removed: Callable[[int], Vibration | FreeMotion]  # from a frame, the middle of which is the time origin
+    is_steady: bool  # whether the frames are moved to a smooth path
 
-    @property
-    def parts(self) -> int:
-        """Number of parts."""
-        return -(-len(self.starts) // PART_FRAMES)
-
-    def decoded(self) -> Generator[Frame | str, None, None]:
-        """Every frame, or why it cannot be read; decoded ahead in a thread."""
-        return prefetched(self._decoded(), _AHEAD)
-
-    def _decoded(self) -> Generator[Frame | str, None, None]:
-        with closing(self.frames.job.open()) as reader:
-            read = reader.planes if self.frames.planar and isinstance(reader, VideoReader) else reader.frame
-            for index in range(len(self.starts)):
-                yield stored_frame(read, index)
-
-    # First pass: the motion
-
-    def motion(self, progress: Callable[[], None]) -> VideoMotion:
-        """The motion of all frames, from corners that are followed from each usable frame to the next one."""
-        timing = self.frames.job.timing
-        half = timing.time_to_middle(self.frames.size[int(timing.scan_axis)])
-        times = np.array(self.starts) + half
-        by_rates = self.rates is not None
-        found = FirstPass(
-            self.frames, self.decoded(), self.starts, times, for_gyroscope=by_rates, stabilised=self.stabilised
-        )
-        if self.rates is None:
-            with ONE_BLAS_THREAD:
-                path = camera_path(found.pairs(progress), timing, self.frames.size, has_tones=not self.stabilised)
-            places = path.places(found.taken)
-            self._check_repetitions(found.repetitions, places[:, :2])
-            shift = self._to_steady(times, lambda number, others: places[others] - places[number], found.cuts)
-            polynomials = np.stack([path.derivatives(found.taken, 1), path.derivatives(found.taken, 2), shift], 1)
-            polynomials[:, :2] *= not self.stabilised
-
-            def by_corners(index: int) -> Vibration:
-                return self._removed(path.tones(float(found.taken[index])), polynomials[index])
-
-            return VideoMotion(path, found.taken, by_corners, found.faults, found.corners)
-        for _ in found.pairs(progress):  # for ``found.compared``, and for ``found.corners``
-            pass
-        tracks = tracks_of_pairs(found.compared, self.starts, timing, self.frames.size)
-        aligned = align_rates(tracks, timing, self.rates, AlignOptions(camera=self.camera))
-        if not aligned.reliable:
-            source, reasons = self.rates.source, "; ".join(aligned.reasons)
-            raise ValueError(f"the gyroscope ({source}) does not fit the video: {reasons}")
-        rotation = RecordedRotation.aligned(self.rates, aligned, found.taken)
-        turned = self._to_steady(times, rotation.apart)
-
-        def by_gyroscope(index: int) -> FreeMotion:
-            return rotation.motion(index, turned[index], half)
-
-        return VideoMotion(aligned, found.taken, by_gyroscope, found.faults, found.corners)
-
-    def _check_repetitions(self, repetitions: dict[int, Array | None], places: Array) -> None:
-        """Raise a ``ValueError`` if the path (N, 2) of at least half of the parts may be wrong by whole repetitions.
-
-        By the corners of a fence with a period of 20 px, the restored frames shook by 3.5 px instead of 2.6 px, and
-        less shaking than before was measured.
-        """
-        unknown: list[tuple[float, float]] = []  # px, of a part: the distance, and the large steps along it
-        for part, shift in repetitions.items():
-            if shift is not None:
-                distance = float(np.hypot(*shift))
-                of_part = places[part * PART_FRAMES : (part + 1) * PART_FRAMES]
-                steps = np.abs(np.diff(of_part, axis=0) @ shift) / distance
-                largest = float(np.quantile(steps, 0.9)) if len(steps) else 0.0
-                if largest > _MOST_OF_REPETITION * distance:
-                    unknown.append((distance, largest))
-        if unknown and 2 * len(unknown) >= len(repetitions):
-            distance, largest = unknown[0]
-            raise ValueError(
-                f"the frames show the same again every {distance:.3g} px, such as a fence, and seem to move by "
-                f"{largest:.2g} px from frame to frame: by how many repetitions they move is not known. Use a part of "
-                "the video with another scene, or a gyroscope"
-            )
-
-    def _to_steady(self, times: Array, apart: Callable[[int, slice], Array], cuts: Sequence[int] = ()) -> Array:
-        return steady_shifts(times, apart, self.options.steady, self.frames.size, self.options.crop_limit, cuts)
-
-    def _removed(self, tones: list[Tone], polynomial: Array) -> Vibration:
-        """The tones, skew and wobble by the path, and what the path is not smooth by."""
-        if self.options.steady == 0:  # axes without vibration stay as taken
-            polynomial = polynomial * np.array([any(tone.axis == axis for tone in tones) for axis in range(4)])
-        height, width = self.frames.size
-        seconds = 0.5 * self.frames.job.timing.row_time * max(height, width)
-        reach = np.abs(polynomial) * np.array([[seconds], [seconds**2], [1.0]])
-        axes = 4 if reach[:, 2:].sum() * 0.5 * math.hypot(height, width) > _SMALLEST else 2
-        amplitude, frequency, phase, *_ = tone_tables(tones, axes)
-        return Vibration(amplitude, frequency, phase, *(values[:axes] for values in polynomial))
-
-    def track(self, motion: VideoMotion, index: int) -> FrameTrack:
+    def track(self, index: int) -> FrameTrack:
         """What is removed from a frame."""
-        exposure = None if self.exposures is None else self.exposures[index]
-        return FrameTrack(index, self.starts[index], motion.removed(index), motion.faults.get(index), exposure)
+        return FrameTrack(index, self.removed(index), self.found.faults.get(index))
 
-    def left_alone(self, track: FrameTrack) -> FrameTrack:
-        """What is removed from a frame of a part that restoration makes worse: rows are not moved apart."""
-        if not isinstance(track.motion, Vibration):
-            return track
-        return replace(track, motion=replace(track.motion.scaled(0.0), image_shift=track.motion.image_shift))
-
-    def is_explained(self, motion: VideoMotion, part: int) -> bool:
+    def is_explained(self, part: int) -> bool:
         """Whether the path of the camera and tones explain the corners of a part."""
-        path, frames = motion.path, motion.times[part * PART_FRAMES : (part + 1) * PART_FRAMES]
-        return not isinstance(path, CameraPath) or path.nearest(frames[len(frames) // 2]).residual < path.allowed
+        path, times = self.path, self.found.taken[part * PART_FRAMES : (part + 1) * PART_FRAMES]
+        return not isinstance(path, CameraPath) or path.nearest(times[len(times) // 2]).residual < path.allowed
 
-    def margins(self, motion: VideoMotion) -> Margins:
+    def margins(self) -> Margins:
         """The widest margins of all frames: how far outside of the frame the content of its border was recorded.
 
         They are even, i.e. whole pixels of chroma.
         """
         widest = np.zeros(4)
-        for index in range(len(self.starts)):
-            if index not in motion.faults:
-                track, timing = self.track(motion, index), self.frames.timing_of(0)
-                (x, y), _ = recorded_offsets(track.motion, timing, self.frames.size)
+        for index in range(len(self.frames.starts)):
+            if index not in self.found.faults:
+                timing = self.frames.timing_of(0, index)
+                (x, y), _ = recorded_offsets(self.removed(index), timing, self.frames.size)
                 x, y = (x, y) if timing.scan_axis == -2 else (x.T, y.T)
                 sides = [-y[0].min(), y[-1].max(), -x[:, 0].min(), x[:, -1].max()]
                 widest = np.maximum(widest, sides)
@@ -189,16 +73,16 @@ class VideoPasses:
 
     # Whether restoration helps, and the record of a part
 
-    def shaking(self, motion: VideoMotion, tracks: list[FrameTrack]) -> dict[str, tuple[float, ...]] | None:
+    def shaking(self, tracks: list[FrameTrack]) -> dict[str, tuple[float, ...]] | None:
         """``WindowRecord.shaking`` from frames that follow each other; None if it is unknown.
 
         Before and after are of the same corners: in other frames, others are found, some of them on cars that pass.
         """
         measured: dict[int, Array] = {}  # (2, 3) px, before and after: x, y and rows, of a frame and the next one
         for pair in pairwise(tracks[:CHECKED_FRAMES]):
-            raw = motion.corners.get(pair[0].index)
+            raw = self.found.corners.get(pair[0].index)
             if raw is not None:
-                both = shake(raw), shake(self._restored_corners(motion, pair, raw))
+                both = shake(raw), shake(self._restored_corners(pair, raw))
                 measured[pair[0].index] = np.array([[*moved, rows] for moved, rows in both])
         changes = [measured[index + 1] - measured[index] for index in measured if index + 1 in measured]
         if not changes:
@@ -209,41 +93,36 @@ class VideoPasses:
             "rows": tuple(np.sqrt(np.square(rows).mean(0)).tolist()),
         }
 
-    def _restored_corners(self, motion: VideoMotion, pair: tuple[FrameTrack, FrameTrack], corners: Corners) -> Corners:
+    def _restored_corners(self, pair: tuple[FrameTrack, FrameTrack], corners: Corners) -> Corners:
         """Corners between two frames where they are in the restored ones."""
         places: list[Array] = []
         for number, track in enumerate(pair):
-            exposure = self.frames.timing_of(0, track.exposure).exposure_time
-            starts = corners.times[:, number] - motion.times[track.index] - 0.5 * exposure
+            exposure = self.frames.timing_of(0, track.index).exposure_time
+            starts = corners.times[:, number] - self.found.taken[track.index] - 0.5 * exposure
             recorded = corners.places + (number - 0.5) * corners.offsets
             places.append(places_at_rest(track.motion, recorded, starts, exposure))
         return replace(corners, places=0.5 * (places[0] + places[1]), offsets=places[1] - places[0])
 
-    def is_worse(self, motion: VideoMotion, part: int, tracks: list[FrameTrack]) -> bool:
+    def is_worse(self, part: int, tracks: list[FrameTrack]) -> bool:
         """Whether restoration makes a part shake more, by its first frames.
 
         If it is unknown, whether path and tones do not explain the corners of the part.
         """
-        if not isinstance(motion.path, CameraPath):
+        if not isinstance(self.path, CameraPath):
             return False
-        measured = self.shaking(motion, tracks)
+        measured = self.shaking(tracks)
         if measured is None:
-            return not self.is_explained(motion, part)
+            return not self.is_explained(part)
         return any(shakes_more(*both) for both in measured.values())
 
-    def record(
-        self,
-        part: int,
-        tracks: list[FrameTrack],
-        motion: VideoMotion,
-        *,
-        is_worse: bool,
-    ) -> WindowRecord:
+    def record(self, part: int, tracks: list[FrameTrack], *, is_worse: bool) -> WindowRecord:
         """The record of a part of the video, which was left alone if restoration makes it worse."""
-        path = motion.path
-        detection = part_detection(self.frames, path, motion.times, tracks) if isinstance(path, CameraPath) else None
+        path, first, last = self.path, tracks[0].index, tracks[-1].index
+        detection = None
+        if isinstance(path, CameraPath):
+            detection = part_detection(self.frames, path, self.found.taken, slice(first, last + 1))
         left = []
-        if detection is not None and self.options.steady == 0:  # the rows of axes without tones are not moved
+        if detection is not None and not self.is_steady:  # the rows of axes without tones are not moved
             left = [
                 Reason("axis_not_reliable", name, details={"action": "restored", "why": "; ".join(map(str, why))})
                 for name, why, sizes in zip(
@@ -252,14 +131,14 @@ class VideoPasses:
                 if not sizes.any()
             ]
         moved = any(bool(track.motion.moving_axes().any()) for track in tracks if track.fault is None)
-        shaking = self.shaking(motion, tracks)
+        shaking = self.shaking(tracks)
         helps = shaking is not None and any(after < before for before, after in shaking.values())
         outcome = "worse" if is_worse else "helps" if helps else None
         return WindowRecord(
             window=part,
-            first=tracks[0].index,
-            last=tracks[-1].index,
-            start_time=tracks[0].time,
+            first=first,
+            last=last,
+            start_time=float(self.frames.starts[first]),
             written=len(tracks),
             frames="restored" if moved else "as taken",
             detection=detection,
@@ -270,6 +149,89 @@ class VideoPasses:
         )
 
 
+def video_motion(
+    frames: VideoFrames,
+    options: ProcessVideoOptions,
+    rates: AngularRates | None,
+    camera: Camera | None,
+    progress: Callable[[], None],
+) -> VideoMotion:
+    """The motion of all frames, from corners that are followed from each usable frame to the next one.
+
+    With the ``rates`` of a gyroscope, its rotation is the path; the focal length is that of the ``camera``, or fitted.
+    """
+    found, timing, middles = FirstPass(frames, for_gyroscope=rates is not None), frames.job.timing, frames.middles
+
+    def to_steady(apart: Callable[[int, slice], Array], cuts: Sequence[int] = ()) -> Array:
+        return steady_shifts(middles, apart, options.steady, frames.size, options.crop_limit, cuts)
+
+    if rates is None:
+        with ONE_BLAS_THREAD:
+            path = camera_path(found.pairs(progress), timing, frames.size, has_tones=not frames.stabilised)
+        places = path.places(found.taken)
+        _check_repetitions(found.repetitions, places[:, :2])
+        shift = to_steady(lambda number, others: places[others] - places[number], found.cuts)
+        polynomials = np.stack([path.derivatives(found.taken, 1), path.derivatives(found.taken, 2), shift], 1)
+        polynomials[:, :2] *= not frames.stabilised
+
+        def by_corners(index: int) -> Vibration:
+            """The tones, skew and wobble by the path, and what the path is not smooth by."""
+            tones, polynomial = path.tones(float(found.taken[index])), polynomials[index]
+            if options.steady == 0:  # axes without vibration stay as taken
+                polynomial = polynomial * np.array([any(tone.axis == axis for tone in tones) for axis in range(4)])
+            height, width = frames.size
+            seconds = 0.5 * timing.row_time * max(height, width)
+            reach = np.abs(polynomial) * np.array([[seconds], [seconds**2], [1.0]])
+            axes = 4 if reach[:, 2:].sum() * 0.5 * math.hypot(height, width) > _SMALLEST else 2
+            amplitude, frequency, phase, *_ = tone_tables(tones, axes)
+            return Vibration(amplitude, frequency, phase, *(values[:axes] for values in polynomial))
+
+        return VideoMotion(frames, path, found, by_corners, options.steady > 0)
+    for _ in found.pairs(progress):  # for ``found.compared``, and for ``found.corners``
+        pass
+    tracks = tracks_of_pairs(found.compared, frames.starts.tolist(), timing, frames.size)
+    aligned = align_rates(tracks, timing, rates, AlignOptions(camera=camera))
+    if not aligned.reliable:
+        reasons = "; ".join(aligned.reasons)
+        raise ValueError(f"the gyroscope ({rates.source}) does not fit the video: {reasons}")
+    rotation = RecordedRotation.aligned(rates, aligned, found.taken)
+    turned, half = to_steady(rotation.apart), timing.time_to_middle(frames.size[int(timing.scan_axis)])
+    return VideoMotion(
+        frames, aligned, found, lambda index: rotation.motion(index, turned[index], half), options.steady > 0
+    )
+
+
+def _check_repetitions(repetitions: dict[int, Array | None], places: Array) -> None:
+    """Raise a ``ValueError`` if the path (N, 2) of at least half of the parts may be wrong by whole repetitions.
+
+    By the corners of a fence with a period of 20 px, the restored frames shook by 3.5 px instead of 2.6 px, and
+    less shaking than before was measured.
+    """
+    unknown: list[tuple[float, float]] = []  # px, of a part: the distance, and the large steps along it
+    for part, shift in repetitions.items():
+        if shift is not None:
+            distance = float(np.hypot(*shift))
+            of_part = places[part * PART_FRAMES : (part + 1) * PART_FRAMES]
+            steps = np.abs(np.diff(of_part, axis=0) @ shift) / distance
+            largest = float(np.quantile(steps, 0.9)) if len(steps) else 0.0
+            if largest > _MOST_OF_REPETITION * distance:
+                unknown.append((distance, largest))
+    if unknown and 2 * len(unknown) >= len(repetitions):
+        distance, largest = unknown[0]
+        raise ValueError(
+            f"the frames show the same again every {distance:.3g} px, such as a fence, and seem to move by "
+            f"{largest:.2g} px from frame to frame: by how many repetitions they move is not known. Use a part of "
+            "the video with another scene, or a gyroscope"
+        )
+
+
 def shakes_more(before: float, after: float) -> bool:
     """Whether frames shake visibly more, by rms motions in px, than before."""
     return after > _MORE_SHAKING * before + _VISIBLE_SHAKING
+
+
+def left_alone(track: FrameTrack) -> FrameTrack:
+    """What is removed from a frame of a part that restoration makes worse: rows are not moved apart."""
+    if not isinstance(track.motion, Vibration):
+        return track
+    return replace(track, motion=replace(track.motion.scaled(0.0), image_shift=track.motion.image_shift))
