@@ -342,15 +342,15 @@ class Result(Summarised):
 
         Values are not checked again, so that no device is synchronised.
         """
-
-        def changed(value: Any) -> Any:
-            if isinstance(value, dict):
-                return {key: changed(one) for key, one in value.items()}
+        values: dict[str, object] = {}
+        for name, value in vars(self).items():
             if isinstance(value, Tensor):
-                return function(value)
-            return value.mapped(function) if isinstance(value, Result) else value
-
-        return self._changed(**{name: changed(value) for name, value in vars(self).items()})
+                values[name] = function(value)
+            elif isinstance(value, Result):
+                values[name] = value.mapped(function)
+            elif isinstance(value, dict):
+                values[name] = {key: function(one) if isinstance(one, Tensor) else one for key, one in value.items()}
+        return self._changed(**values)
 
     def to(self, device: torch.device | str) -> Self:
         """The same result with its tensors on another device."""
