@@ -367,9 +367,9 @@ def _lost_rows(images: Tensor, missing: Tensor | None) -> Tensor | None:
     They have one value, where the frames before and after have detail and no row of one value nearby, unless most rows
     of a frame have one value.
     """
-    if images.shape[1] < 2 or not bool(
-        (images[..., :8] == images[..., :1]).all(-1).any()
-    ):  # the latter takes less time
+    # The first columns show in a part of the time that there is no row of one value.
+    possible = (images[..., :8] == images[..., :1]).all(-1).any()
+    if images.shape[1] < 2 or not bool(possible):
         return None
     low, high = images.aminmax(dim=-1)
     contrast = (high - low).amax(2)
