@@ -117,13 +117,12 @@ def steps_after_detection(
         restore = ("restore", frames, frames.with_name("restored.tif"), *settings.arguments, "--vibration", vibration)
         steps.append(next_step("restore the frames", *restore))
     reasons = [reason for of_axis in result.findings for reason in of_axis]
+    codes = {reason.code for reason in reasons}
     run = ("run", frames, frames.with_name("results"), *settings.arguments)
-    if any(reason.code == "other_frame_times" for reason in reasons):
+    if "other_frame_times" in codes:
         steps.append(next_step("restore the frames with the times of those after the lost one", *run))
     # any motion explains frames with a wrong timing as well
-    elif any(reason.kind.free_model for reason in reasons) and not any(
-        one.code.startswith("other_") for one in reasons
-    ):
+    elif any(reason.kind.free_model for reason in reasons) and not any(code.startswith("other_") for code in codes):
         if vibration is not None:  # a run in windows measures vibrations that change
             steps.append(next_step("measure a vibration that changes, and restore the frames", *run))
         motion = ("motion", frames, *settings.arguments, "--out", "motion.csv")

@@ -31,7 +31,7 @@ from rsvib_torch.numerics.tables import Array, median, split_axis, table, take_s
 from rsvib_torch.registration.register import fits_frame
 from rsvib_torch.results.reason import Reason
 
-_MOST_TRIED = 5  # timings of a stack
+_MOST_TRIED = 5  # timings of a stack, each of which takes a detection
 
 
 def other_timings(stacks: GreyFrames, timing: SensorTiming, found: Attempt) -> dict[int, Reason]:
@@ -85,20 +85,17 @@ def _candidates(
 ) -> list[SensorTiming]:
     """Timings with which one stack may agree; ``contradicted``: whether its rows contradict the stated one."""
     num_frames, height, width = stack.images.shape[1:]
-    row_timing, starts = timing.in_row_order(), table(timing.frame_starts(num_frames))
-    one = np.array([index])
-    measurements = take_stacks([found.fitted.measurements], one)
     candidates: list[SensorTiming] = []
     if num_frames > 2:
-        candidates += _with_period(
-            timing, measured_period(measurements, take_stacks([found.fitted.fit], one), starts), height
-        )
-    if num_frames > 2 and contradicted:
-        factor = searched_period(measurements, row_timing, starts)
-        candidates += _with_period(timing, factor, height)
-        if factor is None and timing.frame_start_times is None:
-            first = first_after_gap(take_stacks([found.start.measurements], one), row_timing, starts)
-            candidates += [] if first is None else [with_lost_frame(timing, num_frames, first)]
+        one, row_timing, starts = np.array([index]), timing.in_row_order(), table(timing.frame_starts(num_frames))
+        measurements, fit = take_stacks([found.fitted.measurements], one), take_stacks([found.fitted.fit], one)
+        candidates += _with_period(timing, measured_period(measurements, fit, starts), height)
+        if contradicted:
+            factor = searched_period(measurements, row_timing, starts)
+            candidates += _with_period(timing, factor, height)
+            if factor is None and timing.frame_start_times is None:
+                first = first_after_gap(take_stacks([found.start.measurements], one), row_timing, starts)
+                candidates += [] if first is None else [with_lost_frame(timing, num_frames, first)]
     if contradicted and rotates and width <= timing.frame_rows and fits_frame(width, height, found.options.bands):
         candidates.append(replace(timing, scan_axis="x" if timing.scan_axis == -2 else "y"))
     return candidates

@@ -21,7 +21,6 @@ from rsvib_torch.tracking.window_fit import ROUNDS, robust_weights
 _HEIGHT = 240  # px, to which frames are reduced to compare them as a whole
 _LEAST_PEAK = 0.1  # of a phase correlation; that of frames without a scene in common is lower
 
-
 _zeros = partial(np.zeros, 2)
 
 

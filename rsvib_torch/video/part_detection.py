@@ -122,7 +122,7 @@ def _without_blur(frames: VideoFrames, amplitude: Array, frequency: Array) -> Ar
 def _findings(timing: SensorTiming, tones: list[Tone], window: WindowPath) -> tuple[tuple[Reason, ...], ...]:
     """Reasons against each axis.
 
-    Between frames, tones of f and f + n / T are the same; the times of the rows tell them apart. With a row time
+    Between frames, tones of f and f + n / T are the same; the times of the rows distinguish them. With a row time
     that is wrong by 5 to 50 %, a tone of 93 Hz was explained by two, of 93 and 63 or 123 Hz, and one of 87 Hz along
     the other axis was 57 Hz.
     """
