@@ -43,7 +43,8 @@ def result_of(
     rows = torch.arange(16, last_row, 16).double()
     times = torch.arange(num_pairs)[:, None] * timing.frame_period + rows * timing.row_time
     later = times + timing.frame_period
-    fitted = vibration.offset(times, later, timing.exposure_time)
+    fitted = vibration.mean_displacement(later, timing.exposure_time)
+    fitted = fitted - vibration.mean_displacement(times, timing.exposure_time)
     pairs = torch.tensor([[pair, pair + 1] for pair in range(num_pairs)])
     curve = OffsetCurve(pairs, rows, times, later, fitted.clone(), torch.full_like(times, 0.9), (32, 32))
     tones, axes = torch.full_like(vibration.amplitude, std), torch.full_like(vibration.image_motion, std)

@@ -28,7 +28,7 @@ PSF = rsv.row_psf(STILL, TIMES[:8], TIMING)
 NOISE = rsv.SensorNoise(full_well=5000.0, read_noise=0.01, bits=12)
 REFUSED = rsv.detect_vibration(FRAMES[:1].repeat(2, 1, 1), TIMING)  # a camera at rest: no axis is restored
 MOTION = rsv.FreeMotion.through(TIMES, VIBRATION.displacement(TIMES))
-RATES = rsv.AngularRates(MOTION.knots[1:-1], MOTION.velocity(MOTION.knots[1:-1])[:, [1, 0, 0]] / 1e4)
+RATES = rsv.AngularRates(MOTION.knots[1:-1], MOTION.displacement(MOTION.knots[1:-1])[:, [1, 0, 0]] / 100)
 
 
 def memory_of(value, seen=None, within_tracker=False):

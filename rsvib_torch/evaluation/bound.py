@@ -71,13 +71,12 @@ def _information(
         """From times (...) to the derivatives (P, ...) of the component that each parameter changes."""
         return _sensitivity(motion, times)[unknown]
 
-    # rows (S, T) of the frames that show each row of the scene, and how many of them per row of the scene
+    # rows (S, T) of the frames that show each row of the scene, and how many of them per row of the scene: dr / ds
     moved = _of_middle_column(motion, timing, num_frames, height)
     begin = timing.frame_starts(num_frames, device)
     rows = rows_showing(y[:, None] - top, begin.expand(len(y), num_frames), timing, moved)
     moments = begin + rows * timing.row_time
-    density = 1 / (1 - moved.velocity(moments + 0.5 * timing.exposure_time)[..., 1] * timing.row_time)
-    seen = ((rows >= 0) & (rows <= height - 1)) * density
+    seen = ((rows >= 0) & (rows <= height - 1)) * torch.gradient(rows, dim=0)[0]
 
     # products of the gradients over the columns that all frames show
     shift = moved.mean_displacement(moments, timing.exposure_time)[..., 0]

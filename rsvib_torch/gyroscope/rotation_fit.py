@@ -80,7 +80,7 @@ class RotationModel:
         """Displacements (M, 2) in px at a place 0 ... 1 within the exposures."""
         components = self.components(parameters, self.tracks.times(float(parameters[6]), node))
         camera = replace(self.camera, focal_length=float(parameters[5]))
-        return camera.displacement_of_rays(components, *camera.rays(*self.tracks.place.unbind(-1)))
+        return camera.displacement(components, *self.tracks.place.unbind(-1))
 
     def slopes(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
         """(M, 2, 7) derivatives of ``predicted``, 0 for parameters that are not free, and (M, 2, 3) by components."""

@@ -21,13 +21,6 @@ BEYOND_LINEAR = 1.1  # a rotation by 0.05 rad displaces a corner at 60 degrees b
 _SAME_FOCAL_LENGTH = 0.02  # of both axes of a lens profile; of 1,094, nine in ten differ by less than 1 %
 
 
-def _first(components: Tensor) -> Tensor:
-    """The first of 2 to 4 components of a motion (S, A)."""
-    if components.ndim == 0 or not 2 <= components.shape[-1] <= 4:
-        raise ValueError(f"components must have the shape (..., A) with A = 2 to 4, got {tuple(components.shape)}")
-    return components[..., 0]
-
-
 @dataclass(frozen=True)
 @checked_methods
 class Camera:
@@ -222,12 +215,10 @@ class Camera:
 
         The components are X and Y in px, roll theta in rad and zoom, A = 2 to 4.
         """
-        check_broadcast(components=_first(components), x=x, y=y)
-        return self.displacement_of_rays(components, *self.rays(x.to(components), y.to(components)))
-
-    def displacement_of_rays(self, components: Tensor, u: Tensor, v: Tensor) -> Tensor:
-        """``displacement`` of the content at the rays (u, v, 1)."""
-        check_broadcast(components=_first(components), u=u, v=v)
+        if components.ndim == 0 or not 2 <= components.shape[-1] <= 4:
+            raise ValueError(f"components must have the shape (..., A) with A = 2 to 4, got {tuple(components.shape)}")
+        check_broadcast(components=components[..., 0], x=x, y=y)
+        u, v = self.rays(x.to(components), y.to(components))
         pitch, yaw, roll = self.attitude(components).unbind(-1)
         # Rodrigues: R(-w) r = cos a r - sinc(a) w x r + (1 - cos a) / a^2 w (w . r), a = |w|
         squared = pitch.square() + yaw.square() + roll.square()

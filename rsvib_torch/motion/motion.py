@@ -13,14 +13,13 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks.arguments import check_broadcast, checked_methods
+from rsvib_torch.checks.arguments import checked_methods
 from rsvib_torch.checks.values import check_whole_number
 from rsvib_torch.motion.camera import BEYOND_LINEAR, Camera, displacement_at, displacement_factors
 from rsvib_torch.motion.timing import MAX_BATCH, RowTiming, SensorTiming, row_axes
 from rsvib_torch.results.presentation import Result
 
 _FIXED_POINT_STEPS = 2  # the displacement of 10 px changes by 1 % along y: two steps leave 1e-5 px
-_STEP = 1e-6  # s, of the derivative with respect to time; float64 leaves 1e-8 of the velocity
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -54,10 +53,6 @@ class Motion(Result, ABC):
         """
 
     @abstractmethod
-    def velocity(self, times: Tensor) -> Tensor:
-        """Velocity dD/dt in px/s; arguments and shapes as in ``displacement``."""
-
-    @abstractmethod
     def drift(self, times: Tensor) -> Tensor:
         """Part of the displacement that grows with time, in px: a polynomial of degree 2 that is 0 at time 0.
 
@@ -83,6 +78,15 @@ class Motion(Result, ABC):
     @abstractmethod
     def with_axes(self, order: Sequence[int], signs: Sequence[float]) -> Self:
         """The motion whose component k is ``signs[k]`` (1 or -1) times component ``order[k]`` of this motion."""
+
+    @classmethod
+    def stacked(cls, results: Sequence[Self]) -> Self:
+        """Motions with the same axes, knots and camera as a batch; the new dimension is the first."""
+        batch = super().stacked(results)
+        for name in ("camera", "start", "spacing"):
+            if any(getattr(one, name, None) != getattr(batch, name, None) for one in results):
+                raise ValueError(f"motions with different {name} cannot be stacked")
+        return batch
 
     @property
     def num_axes(self) -> int:
@@ -118,15 +122,6 @@ class Motion(Result, ABC):
     def path(self, starts: Tensor, delays: Tensor) -> Tensor:
         """Displacement (S, N, axes) in px at delays (N,) in s from the starts S of exposures."""
         return self.displacement(starts.to(dtype=torch.float64, device=self.device)[..., None] + delays)
-
-    def offset(self, starts: Tensor, later_starts: Tensor, exposure_time: float) -> Tensor:
-        """Offset (Eq. 4): mean displacement of the later exposure minus that of the earlier one, in px, (S, axes).
-
-        Starts S in s are those of the same scene rows in two frames. The left-hand side of Eq. (4) has the opposite
-        sign.
-        """
-        check_broadcast(starts=starts, later_starts=later_starts)
-        return self.mean_displacement(later_starts, exposure_time) - self.mean_displacement(starts, exposure_time)
 
     def largest_displacement(self, first: float, last: float) -> Tensor:
         """Bound on ``|D(t)|`` for ``first <= t <= last``, (..., axes), in px."""
@@ -225,28 +220,18 @@ class ColumnMotion(Motion, shapes={"column": "..."}):
         heights, _ = torch.broadcast_tensors(row - 0.5 * (self.num_rows - 1), components[..., 0])
         return torch.as_tensor(heights)
 
-    def _content(self, starts: Tensor, components: Tensor) -> tuple[Tensor, Tensor]:
-        """Content of rows exposed from ``starts`` (S) on, at components (S, A): x and y, or rays u and v, (S)."""
-        height, camera = self._heights(starts, components), self.components.camera
-        x = self.column[(..., *(None,) * (height.ndim - self.column.ndim))].expand_as(height)
-        if camera is None:
-            scale = 1.0 + components[..., 3] if components.shape[-1] > 3 else 1.0
-            return x, (height - components[..., 1] - components[..., 2] * x) / scale
-        y = height - components[..., 1]
-        for _ in range(_FIXED_POINT_STEPS):
-            y = height - camera.displacement_of_rays(components, *camera.rays(x, y))[..., 1]
-        return camera.rays(x, y)
-
-    def _displaced(self, components: Tensor, content: tuple[Tensor, Tensor]) -> Tensor:
-        """Displacement (S, 2) of ``_content`` by components (S, A)."""
-        camera = self.components.camera
-        if camera is None:
-            return displacement_at(components, *content)
-        return camera.displacement_of_rays(components, *content)
-
     def _moved(self, starts: Tensor, components: Tensor) -> Tensor:
         """Displacement (S, 2) of the content of rows exposed from ``starts`` (S) on, by components (S, A)."""
-        return self._displaced(components, self._content(starts, components))
+        height, camera = self._heights(starts, components), self.components.camera
+        x = self.column[(..., *(None,) * (height.ndim - self.column.ndim))].expand_as(height)
+        y = height - components[..., 1]
+        if camera is None:
+            scale = 1.0 + components[..., 3] if components.shape[-1] > 3 else 1.0
+            y = (y - components[..., 2] * x) / scale
+        else:
+            for _ in range(_FIXED_POINT_STEPS):
+                y = height - camera.displacement(components, x, y)[..., 1]
+        return displacement_at(components, x, y, camera)
 
     def displacement(self, times: Tensor) -> Tensor:
         """Displacement in px of the rows that begin their exposure at these times."""
@@ -262,14 +247,6 @@ class ColumnMotion(Motion, shapes={"column": "..."}):
         """Mean displacement over exposures in px."""
         starts = starts.to(dtype=torch.float64, device=self.device)
         return self._moved(starts, self.components.mean_displacement(starts, exposure_time))
-
-    def velocity(self, times: Tensor) -> Tensor:
-        """Velocity in px/s of the content of the row that begins its exposure at these times."""
-        times = times.to(dtype=torch.float64, device=self.device)
-        components, velocity = self.components.displacement(times), self.components.velocity(times)
-        content = self._content(times, components)
-        later, earlier = (self._displaced(components + step * velocity, content) for step in (_STEP, -_STEP))
-        return (later - earlier) / (2 * _STEP)
 
     def drift(self, times: Tensor) -> Tensor:
         """Drift of X and Y in px, the same for all columns; that of roll and zoom counts as oscillation."""

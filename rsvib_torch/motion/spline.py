@@ -120,7 +120,6 @@ class FreeMotion(
         displacement: TensorLike,
         *,
         spacing: float | None = None,
-        tones: Vibration | None = None,
         camera: Camera | None = None,
     ) -> "FreeMotion":
         """The motion through displacements (N, A) at increasing times, interpolated in between by cubic splines.
@@ -129,7 +128,6 @@ class FreeMotion(
             times: Seconds, strictly increasing.
             displacement: px; roll, the third of A = 3 columns, in rad, and zoom, the fourth, relative.
             spacing: Time between knots; by default half the median step.
-            tones: Tones that are added.
             camera: Focal length and lens.
         """
         from scipy.interpolate import CubicSpline  # noqa: PLC0415
@@ -150,21 +148,7 @@ class FreeMotion(
         intervals = math.ceil((last - first) / step - 1e-6)  # a whole number for even times, but for rounding
         even = np.linspace(first, last, max(4, intervals + 1))
         interpolated = CubicSpline(grid.numpy(), values.numpy())(even)
-        return cls.through(torch.from_numpy(even), torch.from_numpy(interpolated), tones, camera)
-
-    @classmethod
-    def stacked(cls, motions: Sequence["FreeMotion"]) -> "FreeMotion":
-        """Motions with the same knots as a batch; the new dimension is the first."""
-        if len(motions) == 0:
-            raise ValueError("motions must contain at least one motion")
-        first = motions[0]
-        knots = {(m.start, m.spacing, m.coefficients.shape) for m in motions}
-        if len(knots) > 1:
-            raise ValueError(f"motions of different knots cannot be stacked: {sorted(knots)}")
-        if any(m.camera != first.camera for m in motions):
-            raise ValueError("motions of different cameras cannot be stacked")
-        tones = Vibration.stacked([m.tones for m in motions])
-        return cls(torch.stack([m.coefficients for m in motions]), first.start, first.spacing, tones, first.camera)
+        return cls.through(torch.from_numpy(even), torch.from_numpy(interpolated), camera=camera)
 
     def summary(self) -> str:
         """Duration and range of the motion; of a batch, those of each motion."""
@@ -193,31 +177,17 @@ class FreeMotion(
         count = self.coefficients.shape[-1]
         return self.start + self.spacing * (torch.arange(count, dtype=torch.float64, device=self.device) - 1.0)
 
-    def retimed(self, offset: float, scale: float = 1.0) -> "FreeMotion":
-        """The motion on another clock: ``D(scale t + offset)`` at time t.
-
-        Args:
-            offset: Reading of this motion's clock at time 0, in seconds.
-            scale: Seconds that pass on this motion's clock in one second.
-        """
+    def retimed(self, offset: float) -> "FreeMotion":
+        """The motion on another clock, on which the time 0 is ``offset`` seconds on this one: ``D(t + offset)``."""
         check_number("offset", offset)
-        check_number("scale", scale, above=0.0)
         old = self.tones
         tones = replace(
             old,
-            frequency=old.frequency * scale,
             phase=old.phase + 2 * math.pi * old.frequency * offset,
-            image_motion=(old.image_motion + old.image_acceleration * offset) * scale,
-            image_acceleration=old.image_acceleration * scale**2,
+            image_motion=old.image_motion + old.image_acceleration * offset,
         )
         moved = old.image_motion * offset + 0.5 * old.image_acceleration * offset**2
-        return FreeMotion(
-            self.coefficients + moved[..., None],
-            (self.start - offset) / scale,
-            self.spacing / scale,
-            tones,
-            self.camera,
-        )
+        return replace(self, coefficients=self.coefficients + moved[..., None], start=self.start - offset, tones=tones)
 
     def within(self, first: float, last: float) -> "FreeMotion":
         """The motion between two times in seconds, without the knots that have no influence there.
@@ -233,7 +203,7 @@ class FreeMotion(
         low = min(max(math.floor((first - self.start) / self.spacing), 0), count - 4)
         high = min(max(math.ceil((last - self.start) / self.spacing) + 3, low + 4), count)
         start = self.start + low * self.spacing
-        return FreeMotion(self.coefficients[..., low:high], start, self.spacing, self.tones, self.camera)
+        return replace(self, coefficients=self.coefficients[..., low:high], start=start)
 
     def with_axes(self, order: Sequence[int], signs: Sequence[float]) -> Self:
         """The motion whose component k is ``signs[k]`` (1 or -1) times component ``order[k]`` of this motion."""
@@ -242,24 +212,19 @@ class FreeMotion(
         camera = None if self.camera is None else self.camera.with_axes(order, signs)
         return type(self)(coefficients, self.start, self.spacing, self.tones.with_axes(order, signs), camera)
 
-    def _taps(self, times: Tensor) -> tuple[Tensor, Tensor]:
-        """The four coefficients (S, 2, 4) about times S, and the fraction (S,) of a knot spacing."""
-        batch = self.batch_shape
+    def rest(self, times: Tensor) -> Tensor:
+        """R(t) alone in px; arguments and shapes as in ``displacement``."""
+        times, batch = times.to(dtype=torch.float64, device=self.device), self.batch_shape
         knots = self.coefficients.shape[-1]
+        # 1. The four knots about each time.
         place = ((times - self.start) / self.spacing).clamp(0.0, knots - 3.0)
         cell = place.detach().nan_to_num(0.0).floor().clamp(max=knots - 4.0)  # times that are NaN have NaN results
         index = cell.to(torch.int64)[..., None] + torch.arange(4, device=times.device)
-        if not batch:
-            return self.coefficients.movedim(-2, -1)[index].movedim(-1, -2), place - cell
         index = index.expand(*batch, *index.shape[len(batch) :])
+        # 2. Their coefficients (S, A, 4) times their weights.
         flat = index.reshape(*batch, 1, -1).expand(*batch, self.coefficients.shape[-2], -1)
-        picked = self.coefficients.gather(-1, flat).unflatten(-1, index.shape[len(batch) :])
-        return picked.movedim(len(batch), -2), (place - cell).expand(index.shape[:-1])
-
-    def rest(self, times: Tensor) -> Tensor:
-        """R(t) alone in px; arguments and shapes as in ``displacement``."""
-        taps, fraction = self._taps(times.to(dtype=torch.float64, device=self.device))
-        return (taps * bspline_weights(fraction, 3)[..., None, :]).sum(-1)
+        picked = self.coefficients.gather(-1, flat).unflatten(-1, index.shape[len(batch) :]).movedim(len(batch), -2)
+        return (picked * bspline_weights(place - cell, 3)[..., None, :]).sum(-1)
 
     def drift(self, times: Tensor) -> Tensor:
         """Displacement of the image motion alone in px; arguments and shapes as in ``displacement``."""
@@ -287,14 +252,6 @@ class FreeMotion(
         for node, weight in zip(nodes.tolist(), weights.tolist(), strict=True):
             mean = mean + weight * self.rest(starts + node * exposure_time)
         return mean
-
-    def velocity(self, times: Tensor) -> Tensor:
-        """Velocity dD/dt in px/s; arguments and shapes as in ``displacement``."""
-        times = times.to(dtype=torch.float64, device=self.device)
-        taps, fraction = self._taps(times)
-        inside = ((times > self.start) & (times < self.end))[..., None]
-        moving = (taps * bspline_weights(fraction, 3, derivative=1)[..., None, :]).sum(-1) / self.spacing
-        return self.tones.velocity(times) + torch.where(inside, moving, 0.0)
 
     def largest_oscillation(self) -> Tensor:
         """Bound on the tones and the spline, (..., 2), in px: the sum of amplitudes and the largest coefficient."""

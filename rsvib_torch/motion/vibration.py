@@ -207,7 +207,7 @@ class Vibration(
         return torch.cat([self.amplitude, self.frequency, self.phase, polynomial], -1)
 
     @classmethod
-    def stacked(cls, vibrations: Sequence["Vibration"]) -> "Vibration":
+    def stacked(cls, results: Sequence[Self]) -> Self:
         """Vibrations with the same axes and camera as a batch; the new dimension is the first.
 
         Those with fewer tones have further ones of amplitude 0.
@@ -216,21 +216,13 @@ class Vibration(
             >>> Vibration.stacked([Vibration(2.0, 50.0), Vibration(3.0, 40.0)]).amplitude.shape
             torch.Size([2, 2, 1])
         """
-        if len(vibrations) == 0:
-            raise ValueError("vibrations must contain at least one vibration")
-        first = vibrations[0]
-        if any(one.camera != first.camera for one in vibrations):
-            raise ValueError("motions of different cameras cannot be stacked")
-        if len({one.amplitude.shape[:-1] for one in vibrations}) > 1:
-            raise ValueError(f"vibrations differ in shape: {sorted({tuple(v.amplitude.shape) for v in vibrations})}")
-        count = max(one.amplitude.shape[-1] for one in vibrations)
-        values = {}
-        for name in _LIMITS:
-            parts = [getattr(one, name) for one in vibrations]
-            if name not in _POLYNOMIAL:
-                parts = [functional.pad(part, (0, count - part.shape[-1])) for part in parts]
-            values[name] = torch.stack(parts)
-        return cls(**values, camera=first.camera)
+        missing = [max(other.amplitude.shape[-1] for other in results) - one.amplitude.shape[-1] for one in results]
+        return super().stacked(
+            [
+                one._changed(**{name: functional.pad(getattr(one, name), (0, tones)) for name in _QUANTITIES})
+                for one, tones in zip(results, missing, strict=True)
+            ]
+        )
 
     def scaled(self, factor: Tensor | float) -> "Vibration":
         """The vibration with its components multiplied by factors (..., A), or one factor, that are not negative."""
@@ -303,14 +295,6 @@ class Vibration(
         tones = (amplitude * attenuation * angle.sin()).sum(-1)
         curvature = self._at(middle[..., None], self.image_acceleration) * (_with_trailing(exposure_time, 1) ** 2 / 24)
         return tones + self.drift(middle) + curvature + self._at(middle[..., None], self.image_shift)
-
-    def velocity(self, times: Tensor) -> Tensor:
-        """Velocity dD/dt in px/s; arguments and shapes as in ``displacement``."""
-        times = times.to(dtype=torch.float64, device=self.device)
-        angle, amplitude, frequency = self._angle(times)
-        times = times[..., None]
-        oscillation = (2 * math.pi * frequency * amplitude * angle.cos()).sum(-1)
-        return oscillation + self._at(times, self.image_motion) + self._at(times, self.image_acceleration) * times
 
     def gain(self, interval: float) -> Tensor:
         """Gain 2 sin(pi f m T_row) from displacement to offset over ``interval`` seconds (Eq. 7), (..., 2, K).

@@ -130,7 +130,7 @@ def test_pixels_beyond_all_scales(value):
     [
         (lambda: rsv.SensorTiming(1e-4, 6, 104, frame_start_times=[0.0, 1e300]), "frame_start_times must be at most"),
         (lambda: rsv.SensorTiming(1e-4, 6, 104, scan_axis=torch.zeros(2)), "scan_axis must be -2"),
-        (lambda: rsv.FreeMotion.stacked([]), "motions must contain at least one motion"),
+        (lambda: rsv.FreeMotion.stacked([]), "results must be a list of FreeMotion, at least one, got"),
         (lambda: TIMING.row_starts(2, 2**63), "num_rows must be at most"),
         (lambda: TIMING.frame_starts(2, "nowhere"), "device='nowhere' is not available"),
         (lambda: rsv.Vibration(1e300, 50.0), "amplitude must be at most 1e"),
@@ -293,7 +293,10 @@ def test_pixels_beyond_all_scales(value):
         (lambda: judge(FRAMES, VIBRATION.expanded(2)), "does not fit frames of shape"),
         (lambda: judge(FRAMES * torch.nan), "no pixel with data"),
         *(
-            (lambda motions=motions: rsv.FreeMotion.stacked(motions), r"motions(\[0\])? must be an instance of")
+            (
+                lambda motions=motions: rsv.FreeMotion.stacked(motions),
+                "results must be (a list of FreeMotion|an instance of Sequence)",
+            )
             for motions in (torch.tensor(1.0), torch.zeros(0), np.zeros(3))
         ),
         *(

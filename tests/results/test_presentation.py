@@ -32,7 +32,7 @@ def recording():
 def rates():
     """The same as rates of a gyroscope of a camera with a focal length of 900 px."""
     motion = recording()
-    velocity = motion.velocity(motion.knots[1:-1])
+    velocity = torch.gradient(motion.displacement(motion.knots[1:-1]), spacing=motion.spacing, dim=0)[0]
     zero = torch.zeros_like(velocity[:, 0])
     return rsv.AngularRates(motion.knots[1:-1], torch.stack([velocity[:, 1], -velocity[:, 0], zero], -1) / 900.0)
 
