@@ -1,8 +1,7 @@
-from .alignment import align_motion
 from .gpmf_track import CameraTrack, read_camera_track
 from .gyroscope_rates import AngularRates
 from .read_gyroscope import read_gyroscope
-from .rotation_alignment import AlignOptions, RotationAlignment
+from .rotation_alignment import AlignOptions, RotationAlignment, align_motion
 
 __all__ = [
     "AlignOptions",

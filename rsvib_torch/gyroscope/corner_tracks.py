@@ -11,7 +11,7 @@ from torch import Tensor
 
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array, tensor
-from rsvib_torch.registration.corners import CornerFollower, Corners, Grey, eight_bits
+from rsvib_torch.registration.corners import Grey, eight_bits, find_corners, follow_corners, rows_of_points
 
 CELL_ROWS, CELL_COLUMNS = 6, 8  # cells of a frame, in which residuals may be alike
 _MOST_CORNERS = 480  # of a pair of frames
@@ -60,60 +60,62 @@ def corner_tracks(
     pixels, or None; their exposures start at ``starts`` in s. A frame is compared with the one before if their numbers
     follow each other. Refused are frames of which fewer than half of the pairs have enough corners.
     """
-    follower = CornerFollower(timing, most=_MOST_CORNERS, consistent=False)
     levels: Array | None = None
-    size, before = (0, 0), -2
-    pairs: dict[int, Corners] = {}
+    before: tuple[int, Grey, Grey | None] | None = None
+    pairs: dict[int, Array] = {}
     for number, frame, valid in frames:
         values = frame.cpu().numpy()
         if levels is None:  # the same for all frames, so that places keep their grey level
-            levels, size = np.percentile(values, (0.1, 99.9)), (values.shape[0], values.shape[1])
-        grey = eight_bits(values, levels)
-        followed = follower.next(grey, starts[number], None if valid is None else _inner(valid))
-        if followed is not None and before == number - 1:
-            pairs[before] = followed
-        before = number
-    return tracks_of_pairs(pairs, starts, timing, size)
+            levels = np.percentile(values, (0.1, 99.9))
+        grey, mask = eight_bits(values, levels), None if valid is None else _inner(valid)
+        if before is not None and before[0] == number - 1:
+            pairs[number - 1] = followed_pair(before[1], grey, (before[2], mask))
+        before = number, grey, mask
+    return tracks_of_pairs(pairs, starts, timing, (0, 0) if before is None else before[1].shape)
 
 
-def followed_pair(first: Grey, second: Grey, starts: Sequence[float], timing: SensorTiming) -> Corners:
-    """Corners between two grey frames (H, W), whose exposures start at ``starts`` (2,) in s."""
-    follower = CornerFollower(timing, most=_MOST_CORNERS, consistent=False)
-    follower.next(first, starts[0])
-    followed = follower.next(second, starts[1])
-    assert followed is not None
-    return followed
+def followed_pair(first: Grey, second: Grey, masks: tuple[Grey | None, Grey | None] = (None, None)) -> Array:
+    """Places (N, 2, 2) px, (x, y) of corners in a grey frame (H, W) and in the next one, none where a mask (H, W) is 0.
+
+    Every frame has its own corners, whose errors are independent of those before.
+    """
+    found = find_corners(first, _MOST_CORNERS, mask=masks[0])
+    ends, good = follow_corners(first, second, found)
+    points = np.stack([found, ends], 1)[good]
+    if masks[1] is None:
+        return points
+    x, y = points[:, 1].round().astype(np.int64).T
+    return points[masks[1][y, x] > 0]
 
 
 def tracks_of_pairs(
-    followed: Mapping[int, Corners], starts: Sequence[float], timing: SensorTiming, size: tuple[int, int]
+    followed: Mapping[int, Array], starts: Sequence[float], timing: SensorTiming, size: tuple[int, int]
 ) -> CornerTracks:
-    """The corners of pairs of frames (height, width) = ``size``, by the number of the earlier frame.
+    """The corners (``followed_pair``) of frames (height, width) = ``size``, by the number of the earlier frame.
 
     The exposures of all frames start at ``starts`` in s. Refused as in ``corner_tracks``.
     """
     if not followed:
         raise ValueError("no two different frames follow each other")
-    pairs = list(followed.values())
-    enough = np.array([len(pair.rows) >= _LEAST_CORNERS for pair in pairs])
+    counts = np.array([*map(len, followed.values())])
+    enough = counts >= _LEAST_CORNERS
     if enough.mean() < 0.5:
         raise ValueError(
-            f"only {enough.sum()} of {len(pairs)} pairs of frames have {_LEAST_CORNERS} corners that can be followed: "
+            f"only {enough.sum()} of {len(counts)} pairs of frames have {_LEAST_CORNERS} corners that can be followed: "
             "the frames have too little detail, or show different scenes"
         )
-    (height, width), corners = size, Corners.joined(pairs)
-    used = enough[corners.pairs]
-    pair, offsets, times = corners.pairs[used], corners.offsets[used], corners.times[used]
-    place = corners.places[used] - 0.5 * offsets
-    of_pairs = np.array([[starts[number], starts[number + 1]] for number in followed])
-    cells = np.floor((place / [width, height] + 0.5) * [CELL_COLUMNS, CELL_ROWS]).astype(np.int64)
+    used = np.repeat(enough, counts)
+    pair, points = np.repeat(np.arange(len(counts)), counts)[used], np.concatenate([*followed.values()])[used]
+    sides = np.array(size[::-1])
+    place = points[:, 0] - 0.5 * (sides - 1)
+    cells = np.floor((place / sides + 0.5) * [CELL_COLUMNS, CELL_ROWS]).astype(np.int64)
     return CornerTracks(
         pair=torch.from_numpy(pair),
         cell=torch.from_numpy(cells @ [1, CELL_COLUMNS]),
-        rows=tensor((times - of_pairs[pair] - 0.5 * timing.exposure_time) / timing.row_time),
+        rows=tensor(rows_of_points(points, timing, size)),
         place=tensor(place),
-        offsets=tensor(offsets),
-        starts=tensor(of_pairs),
+        offsets=tensor(points[:, 1] - points[:, 0]),
+        starts=tensor(np.array([[starts[number], starts[number + 1]] for number in followed])),
         size=size,
         exposure_time=timing.exposure_time,
     )

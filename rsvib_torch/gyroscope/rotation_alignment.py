@@ -1,16 +1,22 @@
 """Alignment of the angular rates of a gyroscope with frames: clock, axes, bias, focal length, row time."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import ParamSpec, Protocol
 
 import torch
 from pydantic import Field
 from torch import Tensor
 
+from rsvib_torch.checks.arguments import FramesOrFiles
 from rsvib_torch.checks.values import Number, check_number
 from rsvib_torch.checks.values import options as option_group
 from rsvib_torch.detection.verdict import recording_reasons
-from rsvib_torch.gyroscope.corner_tracks import CornerTracks
+from rsvib_torch.execution.parallel import full_precision, without_gradients
+from rsvib_torch.frames.entry_points import entry_point
+from rsvib_torch.frames.prepare import frames_from_row_order, grey_frames
+from rsvib_torch.gyroscope.corner_tracks import CornerTracks, corner_tracks
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, orientation_matrix
 from rsvib_torch.gyroscope.rotation_fit import RotationFit, RotationModel, fit_robustly, image_components
 from rsvib_torch.gyroscope.rotation_search import Start, search_orientations
@@ -21,6 +27,8 @@ from rsvib_torch.options import MaskedInputOptions
 from rsvib_torch.results.presentation import JudgedResult
 from rsvib_torch.results.reason import Reason
 from rsvib_torch.text import measured_text, text_table, wrapped
+
+P = ParamSpec("P")
 
 _CERTAIN = 25.0  # chi-square by which other axes or offsets fit worse: 5 standard deviations of one parameter
 _MAX_COST, _MOST_OTHERS = 4.0, 5  # starts that are worse by this factor in the search, and further ones, are not fitted
@@ -153,6 +161,70 @@ class AlignOptions(MaskedInputOptions):
         default=False,
         description="Whether to fit the row time as well, with angular rates; ``timing`` has the start value.",
     )
+
+
+class _AlignsMotion(Protocol[P]):
+    """Type of ``align_motion``."""
+
+    def __call__(
+        self, frames: FramesOrFiles, timing: SensorTiming, recorded: AngularRates, *args: P.args, **kwargs: P.kwargs
+    ) -> RotationAlignment:
+        """Call the function."""
+
+
+def _align_options(
+    options: Callable[P, AlignOptions],
+) -> Callable[[Callable[..., RotationAlignment]], _AlignsMotion[P]]:
+    return lambda function: entry_point(options, function)
+
+
+@_align_options(AlignOptions)
+@full_precision
+@without_gradients
+def align_motion(
+    frames: FramesOrFiles, timing: SensorTiming, recorded: AngularRates, options: AlignOptions
+) -> RotationAlignment:
+    """Find offset and scale between the clock of a gyroscope and that of the frames, and the axes of the gyroscope.
+
+    Corners are followed between consecutive frames, and compared with the rotation of the camera between the exposures
+    of their rows, for all 24 assignments of the axes and all offsets. Bias, clock and, without a camera, the focal
+    length are fitted. Robust weights exclude what moves by itself or is fixed to the camera. Every pair of frames has a
+    translation of its own: if the scene has parallax, only displacements across its lines (epipolar lines) determine
+    the rotation.
+
+    Args:
+        frames: Stack (T, H, W) or (T, C, H, W) of at least two frames; tensor, array, list of these, or files; NaN
+            marks missing pixels.
+        timing: The sensor.
+        recorded: The rates of the gyroscope on its own clock.
+        options: Options.
+
+    Returns:
+        The motion on the clock of the frames, offset and scale with standard deviations, and a verdict.
+
+    Raises:
+        TypeError: If frames are not numbers, or the recording is no angular rates.
+        ValueError: If the recording is shorter than the frames or does not cover them at any offset in ``offsets``,
+            frames have too few corners, or an option is out of range.
+
+    Example:
+        See ``RotationAlignment``.
+    """
+    if not isinstance(recorded, AngularRates):
+        raise TypeError(
+            f"recorded must be AngularRates (read_gyroscope), got {type(recorded).__name__}; the clock of a motion in "
+            "px is set by FreeMotion.retimed"
+        )
+    stack = grey_frames(frames, timing, options)
+    timing = stack.timing
+    if stack.batched:
+        raise ValueError(f"align_motion takes one stack, got a batch of {len(stack.images)}")
+    images = frames_from_row_order(stack.images[0], timing)
+    masks = [None] * len(images) if stack.valid is None else frames_from_row_order(stack.valid[0], timing)
+    starts = timing.in_row_order().frame_starts(len(images)).tolist()
+    tracks = corner_tracks(zip(range(len(images)), images, masks, strict=True), starts, timing)
+    with torch.device("cpu"):  # also where another device is the default of PyTorch
+        return align_rates(tracks, timing, recorded, options)
 
 
 def align_rates(

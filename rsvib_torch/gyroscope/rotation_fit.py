@@ -22,7 +22,7 @@ from torch import Tensor
 from rsvib_torch.gyroscope.corner_tracks import CELL_COLUMNS, CELL_ROWS, CornerTracks
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, orientation_matrix
 from rsvib_torch.gyroscope.rotation_search import MIN_FOCAL_LENGTH
-from rsvib_torch.motion.camera import Camera
+from rsvib_torch.motion.camera import Camera, displacement_at
 from rsvib_torch.numerics.interpolation import gauss_legendre
 from rsvib_torch.numerics.tables import scaled_inverse, table, tensor
 
@@ -80,7 +80,8 @@ class RotationModel:
         """Displacements (M, 2) in px at a place 0 ... 1 within the exposures."""
         components = self.components(parameters, self.tracks.times(float(parameters[6]), node))
         camera = replace(self.camera, focal_length=float(parameters[5]))
-        return camera.displacement(components, *self.tracks.place.unbind(-1))
+        x, y = self.tracks.place.unbind(-1)
+        return displacement_at(components, x, y, camera)
 
     def slopes(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
         """(M, 2, 7) derivatives of ``predicted``, 0 for parameters that are not free, and (M, 2, 3) by components."""

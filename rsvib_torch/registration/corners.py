@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from rsvib_torch.motion.camera import displacement_factors
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array, table, tensor
-from rsvib_torch.registration.patch_blur import blur_products
 
 Grey = NDArray[np.uint8]
 Points = NDArray[np.float64]  # (N, 2) px, (x, y) from the middle of the first pixel
@@ -30,6 +29,7 @@ _LARGEST_MOTION = 0.25  # of the longer side, which the coarsest level of the py
 _AROUND = 31
 _MAX_RETURN = 0.3  # px, between a corner and the point where the way back from the other frame ends
 _MOST_PIXELS = 700_000  # of a frame in which corners are followed; the sides of larger ones are halved
+_MOST = 256  # corners of a pair of frames; with 480, clips take twice the time and become no steadier
 _MIN_CORNERS = 8  # of a pair of frames; four components are determined, and wrong matches are rejected
 # Of the corners of a pair, or of those that were followed, that agree on one motion: at night, 130 of 150 corners are
 # noise that is not followed, and 20 lights agree. Of 700 pairs of unrelated frames, a third of them dark, 21 have as
@@ -50,6 +50,10 @@ _SIDES = np.s_[:, 0], np.s_[:, -1], np.s_[0], np.s_[-1]
 # Of a frame that repeats itself at a distance, the correlation with itself: 1.00 of a fence, at most 0.41 of 13 scenes,
 # of bricks as well; and at half of the distance. Beyond this distance from no shift (px), in the middle of this side
 _REPEATS, _BETWEEN, _NEAR, _MIDDLE = 0.8, 0.5, 3, 512
+# px, of a Gaussian filter, before compression and noise have less detail; its effect is fitted, because a vibration
+# across the rows stretches them. Of 38 harmful wrong exposures, 24 were found with 1.2 px and 21 with 0.6 px
+_SMOOTH_BLUR = 1.2
+_HALF_PATCH = 7  # px, half side of a patch; its pixels count by a Gaussian window of half of that
 _NO_CORNERS = np.zeros((0, 2)), np.zeros(0, np.int64)
 
 
@@ -82,73 +86,64 @@ class Corners:
 
 
 class CornerFollower:
-    """Follows corners from each frame of a video to the next.
+    """Follows the corners that move with most others from each frame of a video to the next, as long as they are seen.
 
-    Args:
-        timing: The sensor.
-        most: Number of corners of a pair of frames; with 480, clips take twice the time and become no steadier.
-        consistent: Whether to keep only the corners that move with most others, to follow the same ones as long as they
-            are seen, and to do this in frames of reduced size if these are large. Otherwise every frame has its own
-            corners, whose errors are independent of those before.
-        compare_blur: Whether to compare the blur of the corners, which takes a fifth of the time.
+    Frames are reduced if they are large. To compare the blur of the corners takes a fifth of the time.
     """
 
-    def __init__(
-        self, timing: SensorTiming, *, most: int = 256, consistent: bool = True, compare_blur: bool = False
-    ) -> None:
-        self._timing, self._most, self._consistent, self._compare_blur = timing, most, consistent, compare_blur
+    def __init__(self, timing: SensorTiming, *, compare_blur: bool = False) -> None:
+        self._timing, self._compare_blur = timing, compare_blur
         self._start = 0.0  # s, of the frame before
-        self._before: tuple[Grey, Grey | None] | None = None  # the frame before, of reduced size, and its mask
+        self._before: Grey | None = None  # the frame before, of reduced size
         self._known, self._votes = _NO_CORNERS  # corners in it, and the votes of each of them, see ``_in_layer``
 
-    def next(self, grey: Grey, start: float, mask: Grey | None = None) -> Corners | None:
+    def next(self, grey: Grey, start: float) -> Corners | None:
         """Corners between the frame before and this one (H, W), whose exposure starts at ``start`` in s.
 
-        None for the first frame, and if too few move together. There are none where the mask (H, W) is 0; a mask is for
-        corners that are not ``consistent``: frames are reduced otherwise, and masks are not.
+        None for the first frame, and if too few move together.
         """
         # 1. Follow corners.
-        (height, width), timing = grey.shape, self._timing
-        scale = reduction(*grey.shape) if self._consistent else 1
+        (height, width), timing, scale = grey.shape, self._timing, reduction(*grey.shape)
         before, known, voted = self._before, self._known, self._votes
-        second = np.asarray(cv2.resize(grey, (width // scale, height // scale), interpolation=cv2.INTER_AREA), np.uint8)
-        if self._consistent:
-            around = cv2.blur(second, (_AROUND, _AROUND))
-            second = np.asarray(cv2.addWeighted(second, 1.0, around, -1.0, 128.0), np.uint8)
+        small = cv2.resize(grey, (width // scale, height // scale), interpolation=cv2.INTER_AREA)
+        around = cv2.blur(small, (_AROUND, _AROUND))
+        second = np.asarray(cv2.addWeighted(small, 1.0, around, -1.0, 128.0), np.uint8)
         starts = np.array([self._start, start])
-        self._before, self._start = (second, mask), start
+        self._before, self._start = second, start
         self._known, self._votes = _NO_CORNERS
         if before is None:
             return None
-        found = find_corners(before[0], known, before[1], self._most)
+        found = find_corners(before, _MOST, known)
         votes = np.pad(voted, (0, len(found) - len(voted)))
-        ends, good = follow_corners(before[0], second, found)
-        if mask is not None:
-            x, y = ends[good].round().astype(np.int64).T
-            good[good] = mask[y, x] > 0
+        ends, good = follow_corners(before, second, found)
         found, ends, votes = found[good], ends[good], votes[good]
-        layer = np.ones(len(found), bool)
         # 2. Keep those that are at rest if the camera is, else those that follow one affine motion and the vibration of
         # their rows.
-        axis, count = (1, height) if timing.scan_axis == -2 else (0, width)
-        if self._consistent:
-            agree = np.hypot(*(ends - found).T) < _AT_REST
-            if not _stands_still(found, agree, second.shape):
-                agree = _agreeing(found, ends, axis, second.shape[1 - axis], scale)
-                least = min(_MIN_SHARE * len(good), _MIN_FOLLOWED * len(found))
-                if agree.sum() < max(_MIN_CORNERS, least):
-                    return None
-            found, ends, votes = found[agree], ends[agree], votes[agree]
-            layer = _in_layer(found, ends, votes, scale)
-            self._known, self._votes = ends, np.where(layer, votes + 1, np.minimum(votes, 0) - 1)
-        blur = blur_products(before[0], second, found, ends) if self._compare_blur else np.zeros((len(found), 4, 4))
+        agree = np.hypot(*(ends - found).T) < _AT_REST
+        if not _stands_still(found, agree, second.shape):
+            axis = 1 if timing.scan_axis == -2 else 0
+            agree = _agreeing(found, ends, axis, second.shape[1 - axis], scale)
+            least = min(_MIN_SHARE * len(good), _MIN_FOLLOWED * len(found))
+            if agree.sum() < max(_MIN_CORNERS, least):
+                return None
+        found, ends, votes = found[agree], ends[agree], votes[agree]
+        layer = _in_layer(found, ends, votes, scale)
+        self._known, self._votes = ends, np.where(layer, votes + 1, np.minimum(votes, 0) - 1)
+        blur = blur_products(before, second, found, ends) if self._compare_blur else np.zeros((len(found), 4, 4))
+        # 3. Their places in the frames, and the times of their rows.
         found, ends = ((points + 0.5) * scale - 0.5 for points in (found, ends))
-        # 3. The times of their rows.
-        rows = np.stack([found[:, axis], ends[:, axis]], -1)
-        rows = rows if timing.readout_direction == "forward" else count - 1 - rows
+        rows = rows_of_points(np.stack([found, ends], 1), timing, grey.shape)
         times = starts + rows * timing.row_time + 0.5 * timing.exposure_time
         places = 0.5 * (found + ends) - 0.5 * (np.array([width, height]) - 1)
-        return Corners(np.zeros(len(found), np.int64), rows[:, 0] / count, times, places, ends - found, layer, blur)
+        part = rows[:, 0] / grey.shape[int(timing.scan_axis)]
+        return Corners(np.zeros(len(found), np.int64), part, times, places, ends - found, layer, blur)
+
+
+def rows_of_points(points: Array, timing: SensorTiming, size: tuple[int, ...]) -> Array:
+    """(...) row times from the first row of a frame (H, W) to the rows of points (..., 2)."""
+    axis = 1 if timing.scan_axis == -2 else 0
+    rows: Array = points[..., axis]
+    return rows if timing.readout_direction == "forward" else size[1 - axis] - 1 - rows
 
 
 def _agreeing(found: Points, ends: Points, axis: int, length: int, scale: int) -> NDArray[np.bool_]:
@@ -250,7 +245,7 @@ def _cells_of(points: Points, shape: tuple[int, ...]) -> NDArray[np.int64]:
     return np.asarray(columns * y + x)
 
 
-def find_corners(grey: Grey, known: Points, mask: Grey | None, most: int) -> Points:
+def find_corners(grey: Grey, most: int, known: Points = _NO_CORNERS[0], mask: Grey | None = None) -> Points:
     """The known corners (N, 2) of a frame (H, W), and new ones where a cell has less than half of its number.
 
     All cells have the same number, together at most ``most`` corners. There are none where the mask (H, W) is 0.
@@ -291,3 +286,38 @@ def follow_corners(first: Grey, second: Grey, corners: Points) -> tuple[Points, 
     inside = ((end[:, 0] >= 0) & (end[:, 0] <= np.array(first.shape[::-1]) - 1)).all(1)
     good = returned & inside & (there[:, 0] == 1) & (again[:, 0] == 1) & (return_[:, 0] == 1)
     return end[:, 0].astype(np.float64), good
+
+
+def blur_products(first: Grey, second: Grey, found: Array, ends: Array) -> Array:
+    """(N, 4, 4) products of patches around corners (N, 2) of two frames (H, W), for a fit of their blur.
+
+    They are those of half of the second derivatives along x, of the mixed ones, of half of those along y, and of the
+    difference of both patches; of each, the parts are left out that brightness, contrast, a displacement, and one that
+    changes linearly over the patch explain.
+    """
+    steps = np.arange(-_HALF_PATCH - 1, _HALF_PATCH + 2, dtype=np.float32)
+
+    def patches(frame: Grey, centres: Array) -> NDArray[np.float32]:
+        smooth = cv2.GaussianBlur(frame.astype(np.float32), (0, 0), _SMOOTH_BLUR)
+        x, y = centres.T.astype(np.float32)[..., None, None]
+        shape = len(centres), len(steps), len(steps)
+        at_x, at_y = (np.broadcast_to(at, shape).reshape(-1, len(steps)) for at in (x + steps, y + steps[:, None]))
+        values = cv2.remap(smooth, at_x, at_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101)
+        return np.asarray(values, np.float32).reshape(shape)
+
+    before, after = patches(first, found), patches(second, ends)
+    mean, here = 0.5 * (before + after), np.s_[:, 1:-1, 1:-1]
+    middle = mean[here]
+    left, right, above, below = mean[:, 1:-1, :-2], mean[:, 1:-1, 2:], mean[:, :-2, 1:-1], mean[:, 2:, 1:-1]
+    by_x, by_y, u, v = 0.5 * (right - left), 0.5 * (below - above), steps[1:-1], steps[1:-1, None]
+    mixed = 0.25 * (mean[:, 2:, 2:] - mean[:, 2:, :-2] - mean[:, :-2, 2:] + mean[:, :-2, :-2])
+    left_out = [np.ones_like(by_x), middle, by_x, by_y, u * by_x, u * by_y, v * by_x, v * by_y]
+    by_xx, by_yy = right + left - 2 * middle, below + above - 2 * middle
+    columns = np.stack([*left_out, 0.5 * by_xx, mixed, 0.5 * by_yy, (after - before)[here]], 1)
+    columns *= np.exp(-np.square([u + 0 * v, v + 0 * u]).sum(0) / _HALF_PATCH**2)  # the root of the window
+    flat = columns.reshape(len(columns), columns.shape[1], -1)
+    gram, count = np.asarray(flat @ flat.swapaxes(1, 2), np.float64), len(left_out)
+    inner = gram[:, :count, :count]
+    inner[:, range(count), range(count)] += 1e-6 * np.trace(inner, axis1=1, axis2=2)[:, None] / count
+    explained = gram[:, count:, :count] @ np.linalg.solve(inner, gram[:, :count, count:])
+    return np.asarray(gram[:, count:, count:] - explained)

@@ -37,7 +37,7 @@ class FirstPass:
         self.taken = frames.middles  # (N,) s, middle of every frame, and of copies that of the frame before
         self.faults: dict[int, str] = {}  # number of each frame that cannot be used, with the reason
         self.corners: dict[int, Corners] = {}  # between a frame and the next one, of the first frames of each part
-        self.compared: dict[int, Corners] = {}  # with a gyroscope, likewise, of some frames of the video
+        self.compared: dict[int, Array] = {}  # with a gyroscope, likewise, of some frames of the video
         self.repetitions: dict[int, Array | None] = {}  # without a gyroscope, of each part
         self._chosen = compared_pairs(len(frames.starts)) if for_gyroscope else []
         self._others: set[int] = set()  # frames that show something else than the frame before
@@ -98,8 +98,7 @@ class FirstPass:
             if corners is not None and index % PART_FRAMES < CHECKED_FRAMES:
                 self.corners[index - 1] = corners
             if index - 1 in self._chosen:
-                starts = self._frames.starts[index - 1 : index + 1].tolist()
-                self.compared[index - 1] = followed_pair(before[1], grey, starts, self._timing)
+                self.compared[index - 1] = followed_pair(before[1], grey)
         if corners is not None and self._frames.stabilised:
             both = np.broadcast_to(self.taken[[before[0], index]], corners.times.shape)
             corners = replace(corners, times=both)
