@@ -34,11 +34,6 @@ Parameters = dict[str, Tensor]
 _DRAWN = ("amplitude", "frequency", "phase", "image_motion", "exposure_rows")
 
 
-def _with_turns(components: Tensor) -> Tensor:
-    """Components (..., A) of a motion along x, y, with roll and zoom, (..., 4)."""
-    return functional.pad(components, (0, 4 - components.shape[-1]))
-
-
 @dataclass(frozen=True, eq=False)
 class ImageMotion:
     """Motion of B images in row order, each with its own vibration, start and exposure."""
@@ -49,26 +44,10 @@ class ImageMotion:
     timing: RowTiming  # the sensor; its exposure is not used
     size: tuple[int, int]  # (rows, columns) of the images
 
-    @property
-    def turns(self) -> bool:
-        """Whether there is roll or zoom, so that the columns of a row move differently."""
-        return self.vibration.num_axes > 2
-
-    def trajectory(self) -> tuple[Tensor, Tensor]:
-        """Components (B, R, N, A) at the Gauss-Legendre nodes of the exposures of rows, and weights (N,)."""
-        rows = torch.arange(self.size[0], dtype=torch.float64, device=self.starts.device)
-        starts, motion = self.starts[:, None] + rows * self.timing.row_time, self.vibration
-        if self.turns:  # the last column moves farthest
-            last = torch.full((1,), 0.5 * self.size[1], dtype=torch.float64, device=starts.device)
-            motion = ColumnMotion.of_columns(motion, last, self.timing, 1, self.size[0])
-        count = gauss_node_count(motion, float(self.exposure_time.amax()))
-        nodes, weights = (tensor.to(starts.device) for tensor in gauss_legendre(count))
-        return self.vibration.displacement(starts[..., None] + nodes * self.exposure_time[:, None, None]), weights
-
     def mean_displacement(self, rows: Tensor) -> Tensor:
-        """Mean components (B, S, 4) over the exposures of frame rows (B, S) (Eq. 2); missing ones are 0."""
+        """Mean components (B, S, A) over the exposures of frame rows (B, S) (Eq. 2)."""
         starts = self.starts[:, None] + rows * self.timing.row_time
-        return _with_turns(self.vibration.mean_displacement(starts, self.exposure_time[:, None]))
+        return self.vibration.mean_displacement(starts, self.exposure_time[:, None])
 
     def move(self, points: Tensor) -> Tensor:
         """Positions (x, y) in the frame of scene points (B, S, 2) in px, by Newton's method for their rows."""
@@ -77,7 +56,7 @@ class ImageMotion:
         for _ in range(8):
             residual = points[..., 1] + displacement_at(self.mean_displacement(rows), x, y)[..., 1] - rows
             starts = self.starts[:, None] + rows * self.timing.row_time
-            components = (_with_turns(self.vibration.displacement(times)) for times in (starts, starts + exposure))
+            components = (self.vibration.displacement(times) for times in (starts, starts + exposure))
             begin, end = (displacement_at(at_time, x, y)[..., 1].detach() for at_time in components)
             slope = (end - begin) * self.timing.row_time / exposure
             rows = rows + residual / (1.0 - slope).clamp(min=0.1)
@@ -87,32 +66,35 @@ class ImageMotion:
     def move_images(self, images: Tensor, interpolation: Interpolation) -> Tensor:
         """Form frames (B, C, R, W) in row order from still images, with mirrored boundaries, at least in float32."""
         dtype = images.dtype if images.dtype in (torch.float32, torch.float64) else torch.float32
-        components, weights = self.trajectory()
-        strips = self._strips()
-        displacement = components if strips is None else self._of_strips(components, strips)
-        psf = trajectory_psf(displacement, weights, interpolation=interpolation)
-        psf = type(psf)(psf.first_tap[:, None], psf.weights[:, None], psf.degree)  # the same for all channels
+        # 1. The motion of all columns of a row, or of strips of columns.
+        strips, motion = self._strips(), self.vibration
+        if strips is not None:
+            frames = len(self.starts.unique())
+            motion = ColumnMotion.of_columns(motion, strips.columns, self.timing, frames, self.size[0])
+        # 2. Its path at the Gauss-Legendre nodes of the exposures of rows.
+        rows = torch.arange(self.size[0], dtype=torch.float64, device=self.starts.device)
+        starts, exposure = (
+            values.repeat_interleave(motion.batch_shape[0] // len(values), 0)
+            for values in (self.starts[:, None] + rows * self.timing.row_time, self.exposure_time[:, None, None])
+        )
+        count = gauss_node_count(motion, float(exposure.amax()))
+        nodes, weights = (values.to(starts.device) for values in gauss_legendre(count))
+        # 3. The point spread functions, which are the same for all channels.
+        psf = trajectory_psf(motion.path(starts, nodes * exposure), weights, interpolation=interpolation)
+        psf = type(psf)(psf.first_tap[:, None], psf.weights[:, None], psf.degree)
         if strips is None:
             return blur_rows(images.to(dtype), psf).to(images.dtype)
         return strips.joined(blur_rows(strips.cut(images.to(dtype)), psf)).to(images.dtype)
 
-    def _strips(self, *, max_slide: float = 0.2, min_pitch: float = 16.0) -> ColumnStrips | None:
-        """Strips of columns that move by ``max_slide`` px more or less than their neighbours; None without roll."""
-        if not self.turns:
+    def _strips(self) -> ColumnStrips | None:
+        """Strips of columns that move by 0.2 px more or less than their neighbours; None without roll and zoom."""
+        if self.vibration.num_axes == 2:
             return None
         first, last = float(self.starts.amin()), float(self.starts.amax()) + self.size[0] * self.timing.row_time
         most = self.vibration.largest_displacement(first, last + float(self.exposure_time.amax()))
-        pitch = max(min_pitch, max_slide / max(float(most[..., 2:].amax()), 1e-9))
+        pitch = max(16.0, 0.2 / max(float(most[..., 2:].amax()), 1e-9))
         farthest = float(largest_in_frame(most, self.size[1], self.size[0])[..., 0].amax())
         return ColumnStrips.of(self.size[1], pitch, margin=math.ceil(farthest) + 4)  # 4 px: support of the kernel
-
-    def _of_strips(self, components: Tensor, strips: ColumnStrips) -> Tensor:
-        """Displacements (B S, R, N, 2) of the middles of strips in the rows of the frame; components (B, R, N, A)."""
-        components = _with_turns(components).repeat_interleave(len(strips.firsts), 0)
-        x = strips.columns.to(components.device).repeat(len(self.starts))[:, None, None]
-        rows = torch.arange(self.size[0], dtype=torch.float64, device=components.device)[:, None]
-        across, roll, zoom = components[..., 1:].unbind(-1)
-        return displacement_at(components, x, (rows - 0.5 * (self.size[0] - 1) - across - roll * x) / (1.0 + zoom))
 
     def move_masks(self, masks: Tensor) -> Tensor:
         """Labels (B, C, R, W) moved by the mean displacement of their rows, to the nearest pixel."""
@@ -120,7 +102,8 @@ class ImageMotion:
         rows = torch.arange(R, dtype=torch.float64, device=masks.device)
         columns = torch.arange(W, dtype=torch.float64, device=masks.device)
         # the inverse of the displacement field, about the middle of the image
-        x, y, roll, zoom = self.mean_displacement(rows.expand(B, -1))[:, :, None].unbind(-1)  # (B, R, 1)
+        components = self.mean_displacement(rows.expand(B, -1))[:, :, None]
+        x, y, roll, zoom = functional.pad(components, (0, 4 - components.shape[-1])).unbind(-1)  # (B, R, 1)
         middle_x, middle_y, scale = 0.5 * (W - 1), 0.5 * (R - 1), 1.0 + zoom
         right, down = columns - x - middle_x, rows[:, None] - y - middle_y
         size = scale.square() + roll.square()
@@ -340,10 +323,9 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         vibration = Vibration(amplitude, camera=None, **drawn).to_row_order(self.timing)
         self.timing.check_rows(self._size(params)[0])
         length = self._recording_length(params)
-        starts = self.timing.frame_starts(length) if length > 1 else torch.zeros(1, dtype=torch.float64, device="cpu")
         return ImageMotion(
             vibration=vibration,
-            starts=starts.repeat(len(exposure_rows) // length).to(like.device),
+            starts=self.timing.frame_starts(length).repeat(len(exposure_rows) // length).to(like.device),
             exposure_time=exposure_rows * self.timing.row_time,
             timing=self.timing.in_row_order(),
             size=self._size(params),
