@@ -147,20 +147,15 @@ class RotationAlignment(
 class AlignOptions(MaskedInputOptions):
     """Options of ``align_motion``."""
 
-    camera: Camera | None = Field(
-        default=None, description="Focal length and lens, for angular rates; by default the focal length is fitted."
-    )
-    offsets: tuple[Number, Number] | None = Field(
-        default=None,
-        strict=False,
-        description="Smallest and largest offset in seconds; by default all for which the recording covers the frames. "
-        "A result outside them is refused.",
-    )
-    fit_scale: bool = Field(default=True, description="Whether to fit the ratio of the speeds of the clocks.")
-    fit_row_time: bool = Field(
-        default=False,
-        description="Whether to fit the row time as well, with angular rates; ``timing`` has the start value.",
-    )
+    camera: Camera | None = None
+    """Focal length and lens, for angular rates; by default the focal length is fitted."""
+    offsets: tuple[Number, Number] | None = Field(default=None, strict=False)
+    """Smallest and largest offset in seconds; by default all for which the recording covers the frames. A result
+    outside them is refused."""
+    fit_scale: bool = True
+    """Whether to fit the ratio of the speeds of the clocks."""
+    fit_row_time: bool = False
+    """Whether to fit the row time as well, with angular rates; ``timing`` has the start value."""
 
 
 class _AlignsMotion(Protocol[P]):

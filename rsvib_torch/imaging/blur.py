@@ -21,7 +21,6 @@ from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.interpolation import (
     bspline_coefficients,
-    bspline_coefficients_adjoint,
     bspline_weights,
     mirrored,
     spread_taps,
@@ -171,6 +170,11 @@ def _gather_index(psf: RowPSF, tap: int, scene_size: tuple[int, int]) -> Tensor:
     return mirrored(rows, height)[..., None] * width + mirrored(columns, width)
 
 
+def _coefficients(scene: Tensor, degree: int) -> Tensor:
+    """B-spline coefficients along both axes."""
+    return bspline_coefficients(bspline_coefficients(scene, degree, -1), degree, -2)
+
+
 @outside_graphs
 @full_precision
 def blur_rows(scene: Tensor, psf: RowPSF) -> Tensor:
@@ -184,7 +188,7 @@ def blur_rows(scene: Tensor, psf: RowPSF) -> Tensor:
         psf: Kernels of R rows.
     """
     size = (scene.shape[-2], scene.shape[-1])
-    coefficients = bspline_coefficients(bspline_coefficients(scene, psf.degree, -1), psf.degree, -2)
+    coefficients = _coefficients(scene, psf.degree)
     weights = psf.weights.to(scene.dtype)
     check_broadcast(scene=scene[..., 0, 0], psf=weights[..., 0, 0, 0])
     lead = torch.broadcast_shapes(scene.shape[:-2], weights.shape[:-3])
@@ -232,7 +236,10 @@ def blur_rows_adjoint(frames: Tensor, psf: RowPSF, scene_shape: tuple[int, ...])
         index = _gather_index(psf, tap, size)
         flat = flat.scatter_add(-1, index.flatten(-2).expand(*lead, -1), pixels.flatten(-2))
     scene = flat.unflatten(-1, size).sum_to_size(scene_shape)
-    return bspline_coefficients_adjoint(bspline_coefficients_adjoint(scene, psf.degree, -2), psf.degree, -1)
+    back: Tensor = torch.func.vjp(lambda pixels: _coefficients(pixels, psf.degree), torch.zeros_like(scene))[1](scene)[
+        0
+    ]
+    return back
 
 
 @checked_methods

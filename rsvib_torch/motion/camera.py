@@ -17,7 +17,7 @@ _NEWTON_STEPS = 8  # of the inverse of the distortion; quadratic convergence, 1e
 _LARGEST_ANGLE = 1.55  # rad from the optical axis, of the rays of a fisheye lens; those of 90 degrees have no (u, v, 1)
 _CENTRAL = 1e-5  # squared tangent of the angle, below which series replace quotients of a fisheye lens
 _SAME_ASPECT = 0.01  # of the ratio of width and height; 2160 and 2176 rows of 3840 px are one mode of a camera
-BEYOND_LINEAR = 1.1  # a rotation by 0.05 rad displaces a corner at 60 degrees by 8 % more than its linear part
+_BEYOND_LINEAR = 1.1  # a rotation by 0.05 rad displaces a corner at 60 degrees by 8 % more than its linear part
 _SAME_FOCAL_LENGTH = 0.02  # of both axes of a lens profile; of 1,094, nine in ten differ by less than 1 %
 
 
@@ -302,13 +302,20 @@ def _corners(width: float, height: float, like: Tensor) -> tuple[Tensor, Tensor]
     return like.new_tensor([-x, x, -x, x]), like.new_tensor([-y, -y, y, y])
 
 
+def largest_at(components: Tensor, x: Tensor, y: Tensor, camera: Camera | None) -> Tensor:
+    """Bound (..., 2) in px on the displacement at P places (P, ...), by components within bounds (..., A)."""
+    factors = displacement_factors(x, y, components.shape[-1], camera).abs().amax(0)
+    moved: Tensor = (factors @ components[..., None])[..., 0]
+    return moved if camera is None else moved * _BEYOND_LINEAR
+
+
 def largest_in_frame(components: Tensor, width: int, height: int, camera: Camera | None = None) -> Tensor:
     """Bound (..., 2) in px on the displacement in a frame, by components within bounds (..., A)."""
-    factors = displacement_factors(*_corners(width, height, components), components.shape[-1], camera).abs().amax(0)
+    x, y = _corners(width, height, components)
     if camera is not None:  # a strong barrel distortion is largest within the frame
-        factors = torch.maximum(factors, torch.eye(2, components.shape[-1]).to(factors))
-    moved: Tensor = (factors @ components[..., None])[..., 0]
-    return moved if camera is None else moved * BEYOND_LINEAR
+        centre = components.new_tensor(camera.principal_point)
+        x, y = torch.cat([x, centre[:1]]), torch.cat([y, centre[1:]])
+    return largest_at(components, x, y, camera)
 
 
 def largest_slope(components: Tensor, width: int, height: int, camera: Camera | None = None) -> Tensor:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from rsvib_torch.checks.arguments import checked_methods
 from rsvib_torch.checks.values import check_whole_number
-from rsvib_torch.motion.camera import BEYOND_LINEAR, Camera, displacement_at, displacement_factors
+from rsvib_torch.motion.camera import Camera, displacement_at, largest_at
 from rsvib_torch.motion.timing import MAX_BATCH, RowTiming, SensorTiming, row_axes
 from rsvib_torch.results.presentation import Result
 
@@ -254,11 +254,8 @@ class ColumnMotion(Motion, shapes={"column": "..."}):
 
     def _at_ends_of_rows(self, components: Tensor) -> Tensor:
         """Bound (..., 2) on the displacement by components within bounds (..., A), in any row."""
-        camera, axes = self.components.camera, components.shape[-1]
-        ends = [torch.full_like(self.column, half * self.num_rows) for half in (-0.5, 0.0, 0.5)]
-        reach = torch.stack([displacement_factors(self.column, end, axes, camera).abs() for end in ends]).amax(0)
-        moved: Tensor = (reach @ components[..., None])[..., 0]
-        return moved if camera is None else moved * BEYOND_LINEAR
+        y = torch.stack([torch.full_like(self.column, half * self.num_rows) for half in (-0.5, 0.0, 0.5)])
+        return largest_at(components, self.column, y, self.components.camera)
 
     def largest_oscillation(self) -> Tensor:
         """Bound on ``|D(t) - drift(t)|`` during the frames, (..., 2), in px."""

@@ -351,15 +351,6 @@ class RowTiming(SensorTiming):
     type checker refuses a timing whose frames have not been turned.
     """
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if (self.scan_axis, self.readout_direction) != (-2, "forward"):
-            raise ValueError(
-                "RowTiming must have scan_axis=-2 and readout_direction='forward', got "
-                f"scan_axis={self.scan_axis}, readout_direction={self.readout_direction!r}; "
-                "SensorTiming.in_row_order() converts a timing"
-            )
-
 
 def with_lost_frame(timing: SensorTiming, num_frames: int, first: int) -> SensorTiming:
     """The timing of ``num_frames`` frames of which the one before the frame ``first`` was lost."""

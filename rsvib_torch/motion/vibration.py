@@ -255,33 +255,31 @@ class Vibration(
         """Period T = 1/f in seconds, (..., 2, K); infinite where the frequency is 0."""
         return 1.0 / self.frequency
 
-    def _angle(self, times: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Angles (S, 2, K) of the tones at times S, with amplitude and frequency reshaped to broadcast with them."""
-        steps = times.ndim - len(self.batch_shape)
-        sizes = zip(times.shape, self.batch_shape, strict=False)
-        if steps < 0 or any(size != 1 and count not in (1, size) for size, count in sizes):
-            raise ValueError(
-                f"times must have the batch dimensions {tuple(self.batch_shape)} in front, got {tuple(times.shape)}"
-            )
-        shape = (*self.batch_shape, *(1,) * steps, *self.amplitude.shape[-2:])
-        amplitude, frequency, phase = (t.reshape(shape) for t in (self.amplitude, self.frequency, self.phase))
-        return torch.addcmul(phase, frequency, times[..., None, None], value=2 * math.pi), amplitude, frequency
-
     def _at(self, times: Tensor, values: Tensor) -> Tensor:
-        """Values (..., A) for each motion, to broadcast with times (S, 1)."""
-        return values.reshape(*self.batch_shape, *(1,) * (times.ndim - 1 - len(self.batch_shape)), -1)
+        """Values (..., A) or (..., A, K) of each motion, to broadcast with those at times S."""
+        batch, steps = self.batch_shape, times.ndim - len(self.batch_shape)
+        if steps < 0 or any(
+            size != 1 and count not in (1, size) for size, count in zip(times.shape, batch, strict=False)
+        ):
+            raise ValueError(f"times must have the batch dimensions {tuple(batch)} in front, got {tuple(times.shape)}")
+        return values.reshape(*batch, *(1,) * steps, *values.shape[len(batch) :])
+
+    def _angle(self, times: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Angles (S, A, K) of the tones at times S, with amplitude and frequency reshaped to broadcast with them."""
+        amplitude, frequency, phase = (self._at(times, getattr(self, name)) for name in _QUANTITIES)
+        return torch.addcmul(phase, frequency, times[..., None, None], value=2 * math.pi), amplitude, frequency
 
     def drift(self, times: Tensor) -> Tensor:
         """Displacement v t + a t^2 / 2 of the image motion alone in px; arguments and shapes as in ``displacement``."""
-        times = times.to(dtype=torch.float64, device=self.device)[..., None]
+        times = times.to(dtype=torch.float64, device=self.device)
         velocity, acceleration = self._at(times, self.image_motion), self._at(times, self.image_acceleration)
-        return torch.addcmul(velocity, acceleration, times, value=0.5) * times
+        return torch.addcmul(velocity, acceleration, times[..., None], value=0.5) * times[..., None]
 
     def displacement(self, times: Tensor) -> Tensor:
         """Displacement D(t) in px (Eq. 1), float64 (S, axes), at times of shape S as in ``Motion.displacement``."""
         times = times.to(dtype=torch.float64, device=self.device)
         angle, amplitude, _ = self._angle(times)
-        return (amplitude * angle.sin()).sum(-1) + self.drift(times) + self._at(times[..., None], self.image_shift)
+        return (amplitude * angle.sin()).sum(-1) + self.drift(times) + self._at(times, self.image_shift)
 
     def mean_displacement(self, starts: Tensor, exposure_time: float | Tensor) -> Tensor:
         """Mean displacement over exposures [start, start + T_e] in px (Eq. 2), as in ``Motion.mean_displacement``.
@@ -293,8 +291,8 @@ class Vibration(
         angle, amplitude, frequency = self._angle(middle)
         attenuation = torch.sinc(frequency * _with_trailing(exposure_time, 2))
         tones = (amplitude * attenuation * angle.sin()).sum(-1)
-        curvature = self._at(middle[..., None], self.image_acceleration) * (_with_trailing(exposure_time, 1) ** 2 / 24)
-        return tones + self.drift(middle) + curvature + self._at(middle[..., None], self.image_shift)
+        curvature = self._at(middle, self.image_acceleration) * (_with_trailing(exposure_time, 1) ** 2 / 24)
+        return tones + self.drift(middle) + curvature + self._at(middle, self.image_shift)
 
     def gain(self, interval: float) -> Tensor:
         """Gain 2 sin(pi f m T_row) from displacement to offset over ``interval`` seconds (Eq. 7), (..., 2, K).

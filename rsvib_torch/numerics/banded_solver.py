@@ -18,9 +18,7 @@ What both eliminations leave of the middle is one small matrix.
 interpolated.
 """
 
-from dataclasses import dataclass, field
-from functools import cached_property
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -65,20 +63,9 @@ def from_both_ends(skewed: Tensor) -> Tensor:
     return torch.cat([halves, halves.new_zeros(width, *halves.shape[1:])])
 
 
-class _Memory(NamedTuple):
-    """Memory of a solution, with the views of every step: creating them takes as long as a solution of few systems."""
-
-    x: Tensor  # (H + b, M, 2 S), the last rows are 0
-    rows: tuple[Tensor, ...]  # the H first rows
-    runs: tuple[Tensor, ...]  # rows j ... j + b - 1, for j = 0 ... H
-
-
 @dataclass(frozen=True, eq=False)
 class BandedFactor:
-    """``A = U^H D U`` of a batch of banded matrices, eliminated from both ends: 2 S halves of H rows.
-
-    A factor must not be used by two threads at the same time.
-    """
+    """``A = U^H D U`` of a batch of banded matrices, eliminated from both ends: 2 S halves of H rows."""
 
     # (H, b, 2 S), ``[j, i - 1]`` is ``U[j, j + i]``; rows that are not eliminated are 0
     upper: Tensor
@@ -87,7 +74,6 @@ class BandedFactor:
     # times as much to rounding
     middle: Tensor
     middle_inverse: Tensor
-    _memories: dict[int, _Memory] = field(default_factory=dict, init=False)
 
     @property
     def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -111,37 +97,24 @@ class BandedFactor:
         half = len(self.upper)
         return torch.cat([values[:half], values.flip(0)[:half]], -1)
 
-    @cached_property
-    def _rows(self) -> tuple[Tensor, ...]:
-        """U right of the diagonal, (b, 1, 2 S) of each eliminated row."""
-        return self.upper[: len(self.inverse), :, None].unbind()
-
-    @cached_property
-    def _columns(self) -> tuple[Tensor, ...]:
-        """U above the diagonal, (b, 1, 2 S) of the columns from b on."""
-        (half, width, size), (line, entry, _) = self.upper.shape, self.upper.stride()
-        shape, first = (max(0, half - width), width, 1, size), self.upper.storage_offset() + (width - 1) * entry
-        return self.upper.as_strided(shape, (line, line - entry, entry, 1), first).unbind()
-
-    def _memory(self, right_side: Tensor) -> _Memory:
-        """Memory for right sides (K, M, S)."""
-        (half, width, size), channels = self.upper.shape, right_side.shape[1]
-        if channels not in self._memories:
-            x = right_side.new_zeros(half + width, channels, size)
-            self._memories[channels] = _Memory(x, x[:half].unbind(), x.unfold(0, width, 1).movedim(-1, 1).unbind())
-        return self._memories[channels]
-
     def solve(self, right_side: Tensor) -> Tensor:
         """Solve ``A x = right_side`` for right sides (K, M, S)."""
-        (half, width, _), steps = self.upper.shape, len(self.inverse)
-        x, rows, runs = self._memory(right_side)
+        (half, width, size), steps = self.upper.shape, len(self.inverse)
+        x = right_side.new_empty(half + width, right_side.shape[1], size)
         both = x[:half]
         both.copy_(self.halves(right_side).conj())
         first, second = both.split(right_side.shape[-1], -1)
         second[steps:] = 0
         x[half:] = 0
+        # U right of the diagonal, (b, 1, 2 S) of each row, and above it, of the columns from b on; views of x
+        upper = self.upper[:steps, :, None].unbind()
+        line, entry, _ = self.upper.stride()
+        first_column = self.upper.storage_offset() + (width - 1) * entry
+        shape = (max(0, half - width), width, 1, size)
+        columns = self.upper.as_strided(shape, (line, line - entry, entry, 1), first_column).unbind()
+        rows, runs = both.unbind(), x.unfold(0, width, 1).movedim(-1, 1).unbind()
         # 1. U^H y = g is U^T y^* = g^*: both substitutions use the same U.
-        for value, row, below in zip(rows, self._rows, runs[1:], strict=False):
+        for value, row, below in zip(rows, upper, runs[1:], strict=False):
             below.addcmul_(row, value, value=-1)
         if x.is_complex():
             x.conj_physical_()
@@ -153,10 +126,10 @@ class BandedFactor:
         both[steps:] = torch.cat([middle, middle.flip(0)], -1)
         # 3. U x = y, the first b rows one by one.
         for j in range(half - 1, width - 1, -1):
-            runs[j - width].addcmul_(self._columns[j - width], rows[j], value=-1)
+            runs[j - width].addcmul_(columns[j - width], rows[j], value=-1)
         for j in range(min(width - 1, steps) - 1, -1, -1):
             later = x[j + 1 : width]
-            rows[j].sub_((self._rows[j][: len(later)] * later).sum(0))
+            rows[j].sub_((upper[j][: len(later)] * later).sum(0))
         return torch.cat([first, second[:steps].flip(0)])
 
 

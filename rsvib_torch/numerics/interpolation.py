@@ -2,18 +2,17 @@
 
 import math
 from collections.abc import Iterator
-from functools import cache, partial
+from functools import cache
 from math import comb, factorial
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy import fft, special
-from scipy.special import roots_legendre
 from torch import Tensor
 
 from rsvib_torch.execution.parallel import gathered, runs
-from rsvib_torch.numerics.tables import Array, constant, table, tensor
+from rsvib_torch.numerics.tables import Array, table, tensor
 
 
 def bspline_weights(fraction: Tensor, degree: int, derivative: int = 0) -> Tensor:
@@ -141,12 +140,6 @@ def bspline_coefficients(samples: Tensor, degree: int, dim: int) -> Tensor:
     return correlated(samples.index_select(dim, index), kernel, dim)[0]
 
 
-def bspline_coefficients_adjoint(values: Tensor, degree: int, dim: int) -> Tensor:
-    """Adjoint (transpose) of ``bspline_coefficients``."""
-    adjoint = torch.func.vjp(partial(bspline_coefficients, degree=degree, dim=dim), torch.zeros_like(values))[1]
-    return adjoint(values)[0]
-
-
 def _toeplitz(kernels: Tensor, rows: int, step: int = 1) -> Tensor:
     """Matrix (..., rows, (rows - 1) step + N) whose product with samples is their correlation with kernels (..., N)."""
     reach = (rows - 1) * step
@@ -186,7 +179,7 @@ def correlated(samples: Tensor, kernels: Tensor, dim: int, step: int = 1) -> Ten
 @cache
 def gauss_legendre(count: int) -> tuple[Tensor, Tensor]:
     """Gauss-Legendre nodes (N,) within 0 ... 1, and weights that sum to 1, float64; cached, do not modify them."""
-    nodes, weights = roots_legendre(count)  # 10,000 nodes in 2 s; numpy.polynomial.legendre.leggauss: minutes
+    nodes, weights = special.roots_legendre(count)  # 10,000 nodes in 2 s; numpy.polynomial.legendre.leggauss: minutes
     with torch.inference_mode(False):  # later callers may differentiate
         return torch.from_numpy((nodes + 1) / 2), torch.from_numpy(weights / 2)
 
@@ -243,18 +236,6 @@ def fourier_sums(times: Array, values: Array, grid: tuple[float, int, int]) -> A
     return sums.reshape(*values.shape[:-2], count)
 
 
-def _mirrored_ends(width: int, extra: int) -> Array:
-    """Pixels that are mirrored at the right end, then those at the left end, of rows that are extended by ``extra``."""
-    steps = np.arange(1, extra + 1)
-    return np.concatenate([(width - 1 - steps).clip(0), steps[::-1].clip(None, width - 1)])
-
-
-def _blend(extra: int, hold: float) -> Array:
-    """Share of the right end in the extension."""
-    progress = ((np.arange(1, extra + 1) / (extra + 1) - hold) / (1 - 2 * hold)).clip(0, 1)
-    return 0.5 + 0.5 * np.cos(np.pi * progress)
-
-
 def extend_rows(images: Tensor, length: int, hold: float = 0.25) -> Tensor:
     """Extend rows (..., W) at their right end to ``length``, so that they close smoothly into a period.
 
@@ -268,10 +249,12 @@ def extend_rows(images: Tensor, length: int, hold: float = 0.25) -> Tensor:
     extra = length - width
     if extra <= 0:
         return images
-    sources = constant(_mirrored_ends, width, extra, dtype=torch.int64, device=images.device)
-    share = constant(_blend, extra, hold, dtype=images.dtype, device=images.device)
+    steps = torch.arange(1, extra + 1, device=images.device)
+    progress = ((steps.double() / (extra + 1) - hold) / (1 - 2 * hold)).clamp(0.0, 1.0)
+    share = (0.5 + 0.5 * torch.cos(math.pi * progress)).to(images.dtype)  # of the right end
     # twice the end minus what is mirrored, of both ends; index_select is four times as fast as an index
-    after, before = images.index_select(-1, sources).chunk(2, -1)
+    after = images.index_select(-1, (width - 1 - steps).clamp(min=0))
+    before = images.index_select(-1, steps.flip(0).clamp(max=width - 1))
     ends = torch.lerp(images[..., :1], images[..., -1:], share)
     return torch.cat([images, 2 * ends - torch.lerp(before, after, share)], dim=-1)
 

@@ -34,11 +34,6 @@ def split_axis(values: Array, axis: int, *sizes: int) -> Array:
     return values.reshape(*values.shape[:axis], *sizes, *values.shape[axis + 1 :])
 
 
-def true_runs(values: Array) -> Array:
-    """(R, 2) start and end of each run of entries that are True."""
-    return np.flatnonzero(np.diff(values, prepend=False, append=False)).reshape(-1, 2)
-
-
 def without_nan(values: Array, replacement: float) -> Array:
     """The values with a number in place of NaN."""
     return np.where(np.isnan(values), replacement, values)

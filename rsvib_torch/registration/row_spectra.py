@@ -87,32 +87,30 @@ class RowSpectra:
         part.valid = None if self.valid is None else overlapping(self.valid, count)
         return part
 
+    def _with(self, values: Tensor, valid: Tensor | None) -> "RowSpectra":
+        """Other spectra of the same frequencies, with a mask."""
+        other = copy(self)
+        other.values, other.valid = values, valid
+        other._index_rows()
+        return other
+
     def stacks(self, index: Tensor) -> "RowSpectra":
         """The spectra of some of the stacks; the values are copied."""
-        part = copy(self)
-        part.values = self.values[index]
-        part.valid = None if self.valid is None else self.valid[index]
-        part._index_rows()
-        return part
+        return self._with(self.values[index], None if self.valid is None else self.valid[index])
 
     def band(self, frequencies: slice) -> "RowSpectra":
         """Some of the frequencies of all frames; the values are copied."""
-        part = copy(self)
-        part.values, part.frequencies = self.values[..., frequencies].contiguous(), self.frequencies[frequencies]
-        part._band = frequencies
-        part._index_rows()
+        part = self._with(self.values[..., frequencies].contiguous(), self.valid)
+        part.frequencies, part._band = self.frequencies[frequencies], frequencies
         return part
 
     def followed_by(self, later: "RowSpectra") -> "RowSpectra":
         """The spectra of these and of later frames of the same size."""
-        both = copy(self)
-        both.values = torch.cat([self.values, later.values], 1)
-        both._index_rows()
-        masks = [part.valid for part in (self, later)]
+        masks, valid = [part.valid for part in (self, later)], None
         if any(mask is not None for mask in masks):
             everything = self._first_rows.new_ones(1, 1, self.height, self.width, dtype=torch.bool)
-            both.valid = torch.cat([everything if mask is None else mask for mask in masks], 1)
-        return both
+            valid = torch.cat([everything if mask is None else mask for mask in masks], 1)
+        return self._with(torch.cat([self.values, later.values], 1), valid)
 
     def warped(self, rows: Tensor, shift: Tensor) -> Tensor:
         """Spectra (B, T, S, U) of frames at fractional rows, moved back by ``shift`` px; both (B, T, S)."""
@@ -147,10 +145,7 @@ class RowSpectra:
 
     def without(self, pattern: Tensor) -> "RowSpectra":
         """The spectra less a pattern (B, U) that every row of these frames contains."""
-        part = copy(self)
-        part.values = self.values - pattern[:, None, None].to(self.values.dtype)
-        part._index_rows()
-        return part
+        return self._with(self.values - pattern[:, None, None].to(self.values.dtype), self.valid)
 
     def warped_valid(self, rows: Tensor, shift: Tensor) -> Tensor | None:
         """(B, S, W) bool, pixels of the scene that are valid in all frames; None for all."""

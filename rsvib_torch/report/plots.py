@@ -32,7 +32,7 @@ from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
-from rsvib_torch.numerics.tables import Array, true_runs
+from rsvib_torch.numerics.tables import Array
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.restoration import RestorationVerdict
 from rsvib_torch.results.presentation import AXIS_NAMES, AXIS_UNITS, FIGURES, figure_png
@@ -488,7 +488,7 @@ def _spectrum_figure(result: detection.DisplacementSpectrum) -> Figure:
     figure, panels = _panels(6.5 * axes, 6.4, 2, axes, sharex=True)
     frequency, half = result.frequency.numpy(), 0.25 * result.resolution  # half of a step
     # first and last of each run of blind neighbours
-    runs = true_runs(result.blind.numpy()) - [0, 1]
+    runs = np.flatnonzero(np.diff(result.blind.numpy(), prepend=False, append=False)).reshape(-1, 2) - [0, 1]
     for axis, name in enumerate(AXIS_NAMES[:axes]):
         unit, colour = AXIS_UNITS[axis], _AXIS_COLOURS.get(name, _INK)
         curves = ((result.amplitude, result.noise, unit), (result.psd, result.noise_psd, f"{unit}²/Hz"))

@@ -124,10 +124,6 @@ class _MeasuredRows:
         """(1, N, G, 2) px, displacements without those by the tones of both axes."""
         return self.measurements.displacements - np.stack([self.model(one.values)[0] for one in tones], -1)
 
-    def reweighted(self, tones: list["_Tones"]) -> "_MeasuredRows":
-        """The rows with weights, and a number of independent ones, by the residual of the tones of both axes."""
-        return replace(self, measurements=self.measurements.weighed(self.residual(tones)))
-
 
 @dataclass(frozen=True, eq=False)
 class _Tones:
@@ -303,7 +299,7 @@ def row_time_of_tones(stack: GreyFrames, clock: CameraClock, options: Registrati
             frames = frames.without(pattern)
             measured = replace(frames, timing=timing).measure(motion)
         rows = _MeasuredRows.of(measured.measurements, num_frames, num_rows, row_time / clock.period)
-        rows = rows.reweighted(tones)
+        rows = replace(rows, measurements=rows.measurements.weighed(rows.residual(tones)))
         before = tones
         tones = [
             _found(rows, axis, highest, _SHARE_OF_ROWS, one.values) if number > 1 else _fitted(rows, axis, one.values)
