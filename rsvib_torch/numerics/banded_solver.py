@@ -25,8 +25,6 @@ import torch
 from torch import Tensor
 from torch.autograd.function import BackwardCFunction, once_differentiable
 
-from rsvib_torch.execution.parallel import runs
-
 
 def _eliminated(skewed: Tensor, steps: int) -> tuple[Tensor, Tensor]:
     """Eliminate the first rows of skewed matrices (K + b, 2 b + 1, S), in their memory: ``upper`` and ``inverse``."""
@@ -207,9 +205,6 @@ def node_frequencies(count: int, step: float, device: torch.device) -> Tensor:
     return torch.tensor(nodes, device=device)
 
 
-_FEW = 256  # frequencies; all at a time take 1.1 times as long for a pair of 1536 x 1536 px
-
-
 @dataclass(frozen=True, eq=False)
 class InterpolatedFactors:
     """``A = U^H D U`` of n batches of matrices at a few frequencies, the nodes.
@@ -230,17 +225,11 @@ class InterpolatedFactors:
     def at(self, part: slice) -> BandedFactor:
         """Factors of n S matrices at S consecutive frequencies."""
         chosen = torch.arange(part.start, part.stop, dtype=torch.float64, device=self.nodes.device)
-        tensors = [values.new_empty(*values.shape[:-1], len(chosen)) for values in self.tensors]
-        # a few frequencies lie between few nodes: products with less zeros
-        for few in runs(len(chosen), _FEW):
-            ends = torch.searchsorted(self.nodes, chosen[few][[0, -1]].long(), right=True)
-            first, last = ends.clamp(max=len(self.nodes) - 1).tolist()
-            near = slice(first - 1, last + 1)
-            places = self.nodes[near].to(torch.float64)
-            rising = (chosen[few] - places[:-1, None]) / places.diff()[:, None]
-            one = torch.ones_like(rising[:1])
-            hat = torch.minimum(torch.cat([one, rising]), torch.cat([1 - rising, one])).clamp(min=0)  # (nodes, S)
-            for of_nodes, values in zip(self.tensors, tensors, strict=True):
-                products = values.flatten(0, -2)[:, few]
-                torch.mm(of_nodes.flatten(0, -2)[:, near], hat.to(of_nodes), out=products)
-        return BandedFactor(*(values.flatten(-2) for values in tensors))
+        ends = torch.searchsorted(self.nodes, chosen[[0, -1]].long(), right=True)
+        first, last = ends.clamp(max=len(self.nodes) - 1).tolist()
+        near = slice(first - 1, last + 1)
+        places = self.nodes[near].to(torch.float64)
+        rising = (chosen - places[:-1, None]) / places.diff()[:, None]
+        one = torch.ones_like(rising[:1])
+        hat = torch.minimum(torch.cat([one, rising]), torch.cat([1 - rising, one])).clamp(min=0)  # (nodes, S)
+        return BandedFactor(*((values[..., near] @ hat.to(values)).flatten(-2) for values in self.tensors))
