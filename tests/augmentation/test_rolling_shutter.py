@@ -1,5 +1,7 @@
 """The augmentation compared with independent cameras, with roll and zoom as well, and in containers of Kornia."""
 
+from dataclasses import replace
+
 import kornia.augmentation as kornia_augmentation
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from kornia.geometry.keypoints import Keypoints
 from scipy.optimize import brentq, fsolve
 from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
 
-from rsvib_torch import RollingShutterVibration, SensorTiming
+from rsvib_torch import RollingShutterVibration, SensorTiming, restore
 
 TIMING = SensorTiming(row_time=40e-6, exposure_rows=30, frame_rows=320)
 HEIGHT, WIDTH = 240, 200
@@ -334,3 +336,13 @@ def test_an_augmentation_has_no_inverse():
         outputs = chain(images, value)
         with pytest.raises(NotImplementedError, match="restore\\(frames, timing, vibration\\)"):
             chain.inverse(outputs[1], data_keys=[data_key])
+
+
+def test_images_are_recorded_at_the_start_of_frame_0():
+    scene = torch.from_numpy(draw_scene(HEIGHT, WIDTH, 5)).float()
+    late = replace(TIMING, frame_start_times=(0.0043, 0.03))
+    augmentation = fixed(Motion(MOTION.amplitude, MOTION.frequency, MOTION.phase), late)
+    frame = augmentation(scene[None, None])[0]
+    restored = restore(frame, late, augmentation.drawn_vibration()[0], check=False)
+    raw, after = ((image - scene)[0, 20:-20, 20:-20].square().mean().sqrt() for image in (frame, restored))
+    assert after < 0.1 * raw
