@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import torch
 from benchmarks import finer, live, mosaic
-from benchmarks.finer import EXPOSURE_ROWS, ROW_TIME, decibel
+from benchmarks.finer import EXPOSURE_ROWS, ROW_TIME
 from benchmarks.finer import MARGIN as FINER_MARGIN
-from benchmarks.independent_camera import POINTS_PER_PX, Array, still_image
+from benchmarks.independent_camera import POINTS_PER_PX, Array, decibel, still_image
 from benchmarks.pipeline import camera
 from benchmarks.resolution_chart import resolution_chart
 from kornia.augmentation import AugmentationSequential
@@ -139,7 +139,7 @@ def finer_grid() -> Figure:
             frames, recording.timing, rsv.detect_vibration(frames, recording.timing), scale=2
         ),
     }
-    images = {f"{name}\n{decibel(image, recording.half):.1f} dB": image for name, image in images.items()}
+    images = {f"{name}\n{decibel(image, recording.half, finer.RIM):.1f} dB": image for name, image in images.items()}
     images["scene after optics and pixel"] = recording.half
     return side_by_side({name: image[60:-60, 90:-90] for name, image in images.items()}, 4.2)
 

@@ -7,11 +7,10 @@ table in results/reason.py. A test fails if the pages are out of date.
 
 import argparse
 import inspect
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
-import griffe
 import harness
 import typer
 from architecture import table_of_packages
@@ -57,13 +56,6 @@ square brackets are omitted where they do not apply. [Verdicts](verdicts.md) exp
 """
 
 
-def documented(thing: object) -> dict[str, str]:
-    """Descriptions of the arguments or attributes in a docstring, by name."""
-    sections = griffe.Docstring(inspect.getdoc(thing) or "").parse("google", warnings=False)
-    kinds = (griffe.DocstringSectionKind.parameters, griffe.DocstringSectionKind.attributes)
-    return {entry.name: entry.description for section in sections if section.kind in kinds for entry in section.value}
-
-
 def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     """A Markdown table of texts of docstrings."""
     return harness.table(
@@ -95,13 +87,13 @@ def type_text(annotation: object) -> str:
     return " or ".join(words)
 
 
-def key_table(group: Any, keys: Iterable[str] = (), meaning: Mapping[str, str] | None = None) -> list[str]:
-    """Table of the keys of a group of options or section, by default of all; ``meaning`` describes fields without."""
+def key_table(group: Any, keys: Iterable[str] = ()) -> list[str]:
+    """Table of the keys of a group of options or section, by default of all."""
     rows = []
     for name in keys or fields_of(group):
         field = fields_of(group)[name]
         shown = "required" if field.is_required() else value_text(field.get_default(call_default_factory=True))
-        rows.append([f"`{name}`", type_text(field.annotation), shown, field.description or (meaning or {})[name]])
+        rows.append([f"`{name}`", type_text(field.annotation), shown, field.description])
     return table(("key", "type", "default", "meaning"), rows)
 
 

@@ -9,7 +9,7 @@ translates what it reports.
 import inspect
 import json
 import types
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache, wraps
 from importlib import import_module
 from pathlib import Path
@@ -30,7 +30,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from rsvib_torch.files.reading import Table, read_text
-from rsvib_torch.text import one_line, quoted
+from rsvib_torch.text import one_line, printable, quoted
 
 Value = TypeVar("Value")
 
@@ -209,11 +209,7 @@ Count = Annotated[int, Field(ge=1, le=2**31)]
 
 
 class MistakesError(ValueError):
-    """Mistakes in one file; ``lines`` has one line for each."""
-
-    def __init__(self, lines: Iterable[str]) -> None:
-        self.lines = tuple(lines)
-        super().__init__("\n".join(self.lines))
+    """Mistakes in one file, with a line of text for each."""
 
 
 # unknown keys are refused, and values are not converted; the text below a field is its description
@@ -305,18 +301,14 @@ def _with_options(text: str, group: object) -> str:
     return "\n".join([before.removesuffix("\n"), *listed, *after.splitlines()[1:]])
 
 
-def validate(group: type[_Result], data: Mapping[str, object], source: str, path: str = "") -> _Result:
-    """Parsed TOML or JSON as a group of options; an error has a line for each mistake in ``source``.
-
-    ``path`` names the table of the source that ``data`` is.
-    """
+def validate(group: type[_Result], data: Mapping[str, object], source: str) -> _Result:
+    """Parsed TOML as a group of options; an error has a line for each mistake in ``source``."""
     try:
         return TypeAdapter(group).validate_python(data, context={"file": source})
     except ValidationError as error:
-        mistakes = mistakes_of(error, data, path, group)
-        lines = [f"{source}: {one_line(mistake)}" for mistake in mistakes]
+        lines = [f"{printable(source)}: {one_line(mistake)}" for mistake in mistakes_of(error, data, group=group)]
         more = [f"{source}: {len(lines) - _MAX_LINES} more mistakes"] if len(lines) > _MAX_LINES else []
-        raise MistakesError([*lines[:_MAX_LINES], *more]) from error
+        raise MistakesError("\n".join([*lines[:_MAX_LINES], *more])) from error
 
 
 def read_json(path: Path, what: str) -> Table:

@@ -16,6 +16,7 @@ from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, get_args, get_origin
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -74,17 +75,14 @@ def decode(kind: type[R], value: object, path: str) -> R:
 
 
 def _tensor(value: object, path: str, missing: float) -> Tensor:
-    def filled(entry: object) -> object:
-        return [filled(part) for part in entry] if isinstance(entry, list) else missing if entry is None else entry
-
-    values = filled(value)
     try:
-        tensor = torch.tensor(values, device="cpu")
-        if tensor.is_floating_point() or not tensor.numel():
-            tensor = torch.tensor(values, dtype=torch.float64, device="cpu")
+        array = np.array(value)
+        if array.dtype == object:  # with None, which becomes NaN
+            array = np.array(value, dtype=np.float64)
+            array[np.isnan(array)] = missing
+        return torch.from_numpy(array)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: expected numbers in lists of equal lengths: {error}") from error
-    return tensor
 
 
 def _tuples(value: object) -> object:
@@ -194,8 +192,9 @@ class Summarised:
     """A class whose objects print as their summary, in the terminal and in notebooks."""
 
     def summary(self) -> str:
-        """The result in a few lines."""
-        raise NotImplementedError
+        """The result in a few lines: here the shapes of its tensors and its other values."""
+        shown = {n: f"tensor {tuple(v.shape)}" if isinstance(v, Tensor) else str(v) for n, v in vars(self).items()}
+        return "\n".join([type(self).__name__, *(f"  {name}: {text}" for name, text in shown.items())])
 
     def __str__(self) -> str:
         return self.summary()
@@ -244,12 +243,6 @@ class Result(Summarised):
             value = getattr(self, name, None)
             if isinstance(value, Tensor) and not value.is_floating_point():
                 raise TypeError(f"{name} must be a floating-point tensor, got {value.dtype}")
-
-    def summary(self) -> str:
-        """The result in a few lines: here the shapes of its tensors and its other values."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
-        shown = {name: f"tensor {tuple(v.shape)}" if isinstance(v, Tensor) else str(v) for name, v in values.items()}
-        return "\n".join([type(self).__name__, *(f"  {name}: {text}" for name, text in shown.items())])
 
     def _changed(self, **values: object) -> Self:
         """The result with some values replaced, without checks."""

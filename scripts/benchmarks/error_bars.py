@@ -31,7 +31,7 @@ from benchmarks.honesty_camera import FINER, MARGIN, Layer, fine_shape, seen_by_
 from benchmarks.honesty_cases import FRAME_PERIOD, Case, Generator, log_uniform, moving, record, tones_of, wave
 from benchmarks.honesty_scenes import city
 from benchmarks.independent_camera import Shake, closed
-from harness import Rows, one_thread, table
+from harness import Rows, table
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d, map_coordinates
@@ -303,21 +303,20 @@ def errors_of(kind: str, number: int, size: int) -> Iterator[Error]:
 
 def rows(options: argparse.Namespace) -> Rows:
     figures: Rows = []
-    with one_thread():
-        for kind in options.bar_kinds:
-            found: dict[str, list[tuple[float, float, float]]] = {}
-            for number in range(options.bar_recordings):
-                for quantity, *values in errors_of(kind, number, options.bar_size):
-                    found.setdefault(quantity, []).append(tuple(values))
-            for quantity, values in found.items():
-                error, std, bound = np.array(values).T
-                z = np.abs(error / std)
-                within = {f"within_{share}": float(np.mean(z < limit)) for share, limit in WITHIN.items()}
-                spread = {"z": float(rms(z[:, None])[0]), **within, "largest": float(z.max())}
-                least = {"std_over_bound": float(np.median(std / bound)), "rms": float(rms(error[:, None])[0])}
-                of_bound = float(rms((error / bound)[:, None])[0]) if np.isfinite(bound).all() else math.nan
-                row = {"kind": kind, "quantity": quantity, "number": len(z)}
-                figures.append(row | spread | least | {"error_over_bound": of_bound})
+    for kind in options.bar_kinds:
+        found: dict[str, list[tuple[float, float, float]]] = {}
+        for number in range(options.bar_recordings):
+            for quantity, *values in errors_of(kind, number, options.bar_size):
+                found.setdefault(quantity, []).append(tuple(values))
+        for quantity, values in found.items():
+            error, std, bound = np.array(values).T
+            z = np.abs(error / std)
+            within = {f"within_{share}": float(np.mean(z < limit)) for share, limit in WITHIN.items()}
+            spread = {"z": float(rms(z[:, None])[0]), **within, "largest": float(z.max())}
+            least = {"std_over_bound": float(np.median(std / bound)), "rms": float(rms(error[:, None])[0])}
+            of_bound = float(rms((error / bound)[:, None])[0]) if np.isfinite(bound).all() else math.nan
+            row = {"kind": kind, "quantity": quantity, "number": len(z)}
+            figures.append(row | spread | least | {"error_over_bound": of_bound})
     return figures
 
 

@@ -18,7 +18,7 @@ from benchmarks import independent_camera
 from benchmarks.independent_camera import Array, Shake, closed
 from benchmarks.pipeline import camera
 from benchmarks.resolution_chart import resolution_chart
-from harness import Rows, one_thread, table
+from harness import Rows, table
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import rsvib_torch as rsv
@@ -287,22 +287,21 @@ def trials(
 
 def rows(options: argparse.Namespace) -> Rows:
     results: Rows = []
-    with one_thread():
-        for target in TARGETS:
-            scene = draw(target, options.trial_size)
-            measured = options.trial_edges if target == "chart" else 0
-            edges = edges_of(scene.still.shape, measured) if measured else []
-            case: dict[str, Any] = {"target": target, "speed": 0.0}
-            for noise in options.trial_noises:
-                still = quality(counts_of(scene.still[None], noise, 0), scene.still, edges)
-                results += [{"part": "restoration", **case, "noise": noise, "seed": 0, "method": STILL, **still[0]}]
-            for seed in range(options.trials):
-                results += trials(scene, case | {"seed": seed}, options.trial_noises, edges)
-        for speed in options.trial_speeds:
-            scene = draw("landscape", options.trial_size, speed)
-            case = {"target": "landscape", "speed": speed}
-            for seed in range(options.trials):
-                results += trials(scene, case | {"seed": seed}, options.trial_noises[:1], None)
+    for target in TARGETS:
+        scene = draw(target, options.trial_size)
+        measured = options.trial_edges if target == "chart" else 0
+        edges = edges_of(scene.still.shape, measured) if measured else []
+        case: dict[str, Any] = {"target": target, "speed": 0.0}
+        for noise in options.trial_noises:
+            still = quality(counts_of(scene.still[None], noise, 0), scene.still, edges)
+            results += [{"part": "restoration", **case, "noise": noise, "seed": 0, "method": STILL, **still[0]}]
+        for seed in range(options.trials):
+            results += trials(scene, case | {"seed": seed}, options.trial_noises, edges)
+    for speed in options.trial_speeds:
+        scene = draw("landscape", options.trial_size, speed)
+        case = {"target": "landscape", "speed": speed}
+        for seed in range(options.trials):
+            results += trials(scene, case | {"seed": seed}, options.trial_noises[:1], None)
     return results
 
 
