@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 import harness
-import typer
 from architecture import table_of_packages
 
 from rsvib_torch.checks.values import fields_of, members_of
+from rsvib_torch.commands.flat_command import option_name
 from rsvib_torch.commands.main import app
 from rsvib_torch.motion.timing import SensorSection
 from rsvib_torch.options import METHOD_OPTIONS, OpticsOptions, RestorationOptions, ToneOptions, WindowOptions
@@ -119,12 +119,8 @@ def parameter_row(parameter: inspect.Parameter) -> list[str]:
     choices = get_args(types[0]) or (types if isinstance(types[0], str) else ())
     choices = [choice for choice in choices if isinstance(choice, str)]
     value = info.metavar or "|".join(choices) or names.get(getattr(types[0], "__name__", ""), "TEXT")
-    named = [info.default, *(info.param_decls or ())]  # typer takes the first name in an annotation for a default
-    option = next((name for name in named if isinstance(name, str)), "--" + parameter.name.replace("_", "-"))
-    if isinstance(info, typer.models.ArgumentInfo):
-        text = parameter.name.upper()
-    else:
-        text = option if types == [bool] else f"{option} {value}"
+    option = option_name(parameter)
+    text = parameter.name.upper() if option is None else option if types == [bool] else f"{option} {value}"
     required = parameter.default is inspect.Parameter.empty
     stated = "" if parameter.default in (None, False) else f"`{parameter.default}`"
     default = info.show_default if isinstance(info.show_default, str) else stated
@@ -142,7 +138,7 @@ def command_page() -> str:
         words = [
             each.name.upper() if each.default is inspect.Parameter.empty else f"[{each.name.upper()}]"
             for each in parameters
-            if isinstance(get_args(each.annotation)[1], typer.models.ArgumentInfo)
+            if option_name(each) is None
         ]
         lines += [f"## rsvib {name}", "", "```text", " ".join(["rsvib", name, *words, "[OPTIONS]"]), "```", ""]
         lines += [inspect.getdoc(command.callback) or "", ""]

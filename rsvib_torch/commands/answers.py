@@ -88,13 +88,16 @@ def restoration_lines(result: stacks.RestoredFrames, count: int) -> list[str]:
 def restoration_of(run: stacks.StackReport) -> tuple[list[str], Table]:
     """What a run restored, as lines and as data, with warnings; of a single window with its verdict."""
     stored = stacks.read_manifest(run.manifest)
-    if run.windows == 1 and run.first is not None and run.first.restoration is not None:
-        first = run.first.restoration
-        warn_of_restoration(first)
-        lines = restoration_lines(first, run.first.window.last + 1)
-        return lines + stored.losses, reports.restoration_data(first)
-    warn_of_failures(stored)
-    return [run.summary(), *stored.lines()[1][1:]], stored.totals()
+    if run.windows != 1 or run.first is None or run.first.restoration is None:
+        warn_of_failures(stored)
+        return [run.summary(), *stored.lines()[1][1:]], stored.totals()
+    result, record = run.first.restoration, stored.windows[0]
+    warn_of_restoration(result)
+    data: Table = {"frames": record.frames, "axes": result.restored_axes()}
+    data["left_alone"] = [reason.to_dict() for reason in record.left_alone]
+    data |= {"outcome": record.outcome, "predicted_gain_db": record.predicted_gain}
+    data["summary"] = None if result.verdict is None else result.verdict.sentence
+    return restoration_lines(result, record.last + 1) + stored.losses, data
 
 
 def next_step(sentence: str, *command: object) -> str:

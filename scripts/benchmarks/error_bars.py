@@ -45,7 +45,7 @@ sys.path += [str(_TESTS), str(_TESTS / "row_time")]
 
 from motion_truth import common_warp, rms  # noqa: E402
 from test_calibrate import HEIGHT, WIDTH, blink, record_frames, shaded, sine  # noqa: E402
-from truth import Curve, draw_scene, take_frames  # noqa: E402
+from truth import Curve, draw_scene, recorded  # noqa: E402
 
 Array = NDArray[np.float64]
 Error = tuple[str, float, float, float]  # quantity, error, standard deviation, bound or NaN
@@ -171,13 +171,6 @@ def tones(kind: str, number: int, size: int) -> Iterator[Error]:
             yield f"{name} {quantity}", error, std, least
 
 
-def recorded(motion: Curve, count: int, draw: Generator) -> torch.Tensor:
-    """Frames of a drawn scene with noise."""
-    scene = draw_scene(ROWS + 80, COLUMNS + 80, int(draw.integers(1000)))
-    clean = take_frames(scene, TIMING, motion, count)
-    return torch.from_numpy(clean + NOISE * draw.standard_normal(clean.shape)).float()
-
-
 # Free motion
 
 
@@ -210,7 +203,8 @@ def free_motion(kind: str, number: int) -> Iterator[Error]:
     """Errors of the rows of each reliable axis, and of what differs between frames, rms over the rows."""
     draw = generator_of(kind, number)
     motion = drawn(kind.removeprefix("free motion: "), draw)
-    found = rsv.detect_motion(recorded(motion, FRAMES, draw), TIMING)
+    frames = recorded((ROWS, COLUMNS), TIMING, motion, FRAMES, NOISE, seed=int(draw.integers(2**32)))
+    found = rsv.detect_motion(frames, TIMING)
     error = found.displacement.numpy() - motion.displacement(found.times.numpy())
     error = (error - error.mean((0, 1)))[:, ::16]
     error, stds = (values[..., found.reliable.numpy()].ravel() for values in (error, found.std.numpy()[:, ::16]))
