@@ -6,6 +6,7 @@ frames.
 
 import argparse
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -65,18 +66,14 @@ def opencv(raw: Array) -> Array:
 def peers() -> dict[str, Demosaicing]:
     """Demosaicing of raw frames (T, H, W) with the pattern RGGB, by the name of the software that is installed."""
     found: dict[str, Demosaicing] = {"OpenCV": opencv}
-    try:
+    with suppress(ImportError):
         from colour_demosaicing import demosaicing_CFA_Bayer_Menon2007 as menon  # noqa: PLC0415
 
         found["Menon"] = lambda raw: np.stack([np.moveaxis(menon(frame, PATTERN), -1, 0) for frame in raw])
-    except ImportError:
-        pass
-    try:
+    with suppress(ImportError):
         from demosaicnet import BayerDemosaick  # noqa: PLC0415
 
         found["demosaicnet"] = partial(network, BayerDemosaick().eval())
-    except ImportError:
-        pass
     return found
 
 

@@ -38,9 +38,7 @@ AMPLITUDE, FREQUENCY = (3.1, 5.2), (50.0, 30.0)
 FULL_ROWS = 2048  # of the paper's camera
 TIMED_BALANCE, TIMED_NOISE = 0.01, 0.005
 PAPER, FASTEST = "matchTemplate, curve_fit, wiener rows (the paper's)", "matchTemplate, curve_fit, remap (fastest)"
-OURS, DEWARP = "detect_vibration, restore", 'detect_vibration, "dewarp"'
-NARROW = "detect_vibration on a quarter of the columns, restore"
-NARROW_DEWARP = 'detect_vibration on a quarter of the columns, "dewarp"'
+OURS = "detect_vibration, restore"
 DETECTIONS: dict[str, dict[str, Any]] = {  # options of detect_vibration; columns is the share of the columns
     "direct": {},
     "narrow": {"columns": 0.25},
@@ -50,9 +48,9 @@ DETECTIONS: dict[str, dict[str, Any]] = {  # options of detect_vibration; column
 }
 CHAINS = {  # of the package: detection and method of restoration
     OURS: ("direct", "exact"),
-    NARROW: ("narrow", "exact"),
-    DEWARP: ("direct", "dewarp"),
-    NARROW_DEWARP: ("narrow", "dewarp"),
+    "detect_vibration on a quarter of the columns, restore": ("narrow", "exact"),
+    'detect_vibration, "dewarp"': ("direct", "dewarp"),
+    'detect_vibration on a quarter of the columns, "dewarp"': ("narrow", "dewarp"),
     '"bands" by "ncc", "dewarp"': ("ncc", "dewarp"),
     '"bands" by "projection", "dewarp"': ("projection", "dewarp"),
     '"bands" on a quarter of the columns, "dewarp"': ("narrow bands", "dewarp"),

@@ -62,7 +62,6 @@ AXES = {"x": "horizontal", "y": "vertical"}
 TARGETS = {"chart": "ISO 12233", "landscape": "in-orbit simulation"}
 ROW_TIME, EXPOSURE_ROWS, FRAME_ROWS = 20.52e-6, 20, 2048
 AMPLITUDE, FREQUENCY = {"x": 3.1, "y": 5.2}, {"x": 50.0, "y": 30.0}  # px, Hz
-PERIOD = {"x": 20.0, "y": 33.33}  # ms, as printed in Table 1
 DETECTED = {
     "chart": {"x": Detected(20.048, 3.147, 0.653, 0.242, 1.526), "y": Detected(33.280, 5.195, 1.234, 0.161, 0.096)},
     "landscape": {"x": Detected(19.890, 3.084, 0.638, 0.551, 0.519), "y": Detected(33.122, 5.211, 1.227, 0.635, 0.218)},
@@ -141,11 +140,6 @@ def draw(target: str, size: Sequence[int], image_motion: float = 0.0) -> Scene:
     samples = closed(drawn.double().numpy(), (BORDER - 8) * PITCH)
     still = samples[down : height - down : PITCH, across : width - across : PITCH]
     return Scene(samples, still)
-
-
-def taken(scene: Scene, shake: Shake, timing: Any, count: int = 2) -> Array:
-    """Frames without noise."""
-    return independent_camera.take_frames(scene.samples, shake, timing, count, scene.still.shape, points=PITCH)
 
 
 def counts_of(frames: Array, noise: float, seed: int) -> Array:
@@ -261,7 +255,7 @@ def trials(
     """Detection and restoration of two frames by all methods for all noises; without edges (None) detection only."""
     shake = shake_of(case["seed"], case["speed"] * (-1) ** case["seed"])
     timing, results = camera(EXPOSURE_ROWS, len(scene.still)), []
-    clean = taken(scene, shake, timing)
+    clean = independent_camera.take_frames(scene.samples, shake, timing, 2, scene.still.shape, points=PITCH)
     for noise in noises:
         array, of_noise = counts_of(clean, noise, case["seed"]), case | {"noise": noise}
         frames = torch.from_numpy(array).float()
