@@ -164,21 +164,11 @@ def _options_at(group: object, keys: Sequence[str | int]) -> list[str]:
 
 def members_of(annotation: object) -> tuple[object, ...]:
     """Members of a union without their bounds, and without None."""
-    annotation = without_alias(annotation)
     if get_origin(annotation) is Annotated:
         return members_of(get_args(annotation)[0])
     if get_origin(annotation) in (Union, types.UnionType):
         return tuple(member for part in get_args(annotation) for member in members_of(part))
     return () if annotation is type(None) else (annotation,)
-
-
-def without_alias(annotation: Any) -> Any:
-    """The annotation that a type alias stands for, as ``NDArray`` of NumPy 2.5 is one."""
-    alias = get_origin(annotation) or annotation
-    if type(alias).__name__ != "TypeAliasType":
-        return annotation
-    arguments = get_args(annotation)
-    return alias.__value__[arguments] if arguments else alias.__value__
 
 
 def needed_package(name: str, purpose: str, extra: str) -> types.ModuleType:
