@@ -207,7 +207,7 @@ def _checked(name: str, value: object, kind: object, *, finite: bool = True) -> 
 def _adapter(kind: object, finite: bool) -> tuple[TypeAdapter[object] | None, tuple[object, ...]]:
     """The check of an annotation, None where the function converts the value itself; and the members of a union."""
     members = members_of(kind)
-    if np.ndarray in members or any(getattr(member, "_is_protocol", False) for member in members):
+    if np.ndarray in members:
         return None, members
     return TypeAdapter(_bounded(kind, finite), config=ConfigDict(strict=True, allow_inf_nan=not finite)), members
 
@@ -218,7 +218,7 @@ def _bounded(kind: Any, finite: bool) -> Any:  # noqa: PLR0911
         return Number
     if kind is int:
         return Annotated[int, Field(ge=-(2**63), le=2**63 - 1)]
-    if kind in (Any, Self) or isinstance(kind, TypeVar) or getattr(kind, "_is_protocol", False):
+    if kind in (Any, Self):
         return object
     if get_origin(kind) is os.PathLike or (isinstance(kind, type) and kind not in _PLAIN and get_origin(kind) is None):
         made_by = f"{kind.__name__} ({kind._MADE_BY})" if hasattr(kind, "_MADE_BY") else None
