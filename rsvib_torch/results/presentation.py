@@ -77,7 +77,7 @@ def decode(kind: type[R], value: object, path: str) -> R:
 def _tensor(value: object, path: str, missing: float) -> Tensor:
     try:
         array = np.array(value)
-        if array.dtype == object:  # with None, which becomes NaN
+        if array.dtype.kind in "Ou":  # with None, which becomes NaN, or beyond the integers of PyTorch
             array = np.array(value, dtype=np.float64)
             array[np.isnan(array)] = missing
         return torch.from_numpy(array)
