@@ -43,11 +43,9 @@ def _decoded(kind: object, value: object, path: str, missing: float) -> object:
         return _tensor(value, path, missing)
     if isinstance(kind, type) and hasattr(kind, "__dataclass_fields__"):
         return decode(kind, value, path)
-    if origin is dict and isinstance(value, dict):
-        return {key: _decoded(parts[1], entry, f"{path}.{key}", missing) for key, entry in value.items()}
     if origin is tuple and hasattr(parts[0], "__dataclass_fields__") and isinstance(value, list):
         return tuple(decode(parts[0], entry, f"{path}[{number}]") for number, entry in enumerate(value))
-    return value if kind is Any else _tuples(value)
+    return _tuples(value)
 
 
 def decode(kind: type[R], value: object, path: str) -> R:
@@ -213,7 +211,7 @@ class Result(Summarised):
 
     The decorator of the class needs ``repr=False``, so that objects print as their summary. Arguments of the class:
     ``units``, the units of its fields, which are written into files; ``shapes``, the axes of its tensors as in
-    ``check_shapes``, where ``"..."`` alone marks a tuple or table with one entry for each result of a batch; and
+    ``check_shapes``, where ``"..."`` alone marks a tuple with one entry for each result of a batch; and
     ``file_format``, the first entry of its files, by default the name of the class.
     """
 
@@ -275,7 +273,7 @@ class Result(Summarised):
         selected: Table = {}
         for name, value in self._fields_of_batch().items():
             if not isinstance(value, Tensor) or value.ndim >= len(self.shapes[name].split()):  # others are common
-                selected[name] = {k: v[index] for k, v in value.items()} if isinstance(value, dict) else value[index]
+                selected[name] = value[index]
         return self._changed(**selected)
 
     @classmethod
@@ -286,8 +284,6 @@ class Result(Summarised):
 
         def joined(values: Sequence[Any]) -> object:
             first = values[0]
-            if isinstance(first, dict):
-                return {key: joined([value[key] for value in values]) for key in first}
             if isinstance(first, Tensor):
                 return torch.stack(values)  # type: ignore[arg-type]
             return type(first).stacked(values) if isinstance(first, Result) else tuple(values)
@@ -341,8 +337,6 @@ class Result(Summarised):
                 values[name] = function(value)
             elif isinstance(value, Result):
                 values[name] = value.mapped(function)
-            elif isinstance(value, dict):
-                values[name] = {key: function(one) if isinstance(one, Tensor) else one for key, one in value.items()}
         return self._changed(**values)
 
     def to(self, device: torch.device | str) -> Self:
