@@ -40,7 +40,7 @@ bench: setup ## run the benchmarks and store their results
 pages: setup ## write the generated pages and drawings of docs/ anew
 	$(PYTHON) scripts/reference_pages.py
 	$(PYTHON) scripts/benchmark.py --pages
-	$(PYTHON) scripts/drawings.py --out docs/drawings
+	$(PYTHON) scripts/figures.py --drawings --out docs
 	$(PYTHON) scripts/run_pages.py
 
 docs: setup ## build the documentation into out/site; warnings are errors

@@ -10,6 +10,7 @@ import argparse
 import os
 import sys
 import time
+import warnings
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
@@ -21,6 +22,8 @@ if find_spec("rsvib_torch") is None:  # the package is not installed: use the wo
 
 import harness
 import torch
+
+import rsvib_torch as rsv
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGE = "benchmarks.md"
@@ -40,24 +43,25 @@ class Section:
     title: str  # heading on the page
     by_default: bool = True  # whether it runs without ``--only``; sections of more than a quarter of an hour do not
     page: str = PAGE  # page in docs/ with its tables; between two marks if it is not that of the benchmarks
+    one_thread: bool = False  # for small tensors, which several threads slow down
 
 
 SECTIONS: dict[str, Section] = {  # in the order of the page
     "cost": Section("Time of difficult inputs"),
-    "finer": Section("Finer grid"),
-    "mosaic": Section("Colour mosaics"),
+    "finer": Section("Finer grid", one_thread=True),
+    "mosaic": Section("Colour mosaics", one_thread=True),
     "pipeline": Section("Detection and restoration"),
     "live": Section("Tracking at camera rate"),
     "video": Section("Colour video"),
     "steady": Section("Hand-held clips made steady"),
     "gpu": Section("Batches and devices"),
     "streaming": Section("Long stacks"),
-    "slanted_edge": Section("Slanted-edge MTF"),
-    "orbit": Section("Vibrations measured in orbit"),
-    "verdict": Section("Verdict on restorations", by_default=False),
-    "honesty": Section("Reliable results that are wrong", by_default=False),
-    "error_bars": Section("Standard deviations", by_default=False, page="verdicts.md"),
-    "reproduction": Section("The paper's tables", by_default=False),
+    "slanted_edge": Section("Slanted-edge MTF", one_thread=True),
+    "orbit": Section("Vibrations measured in orbit", one_thread=True),
+    "verdict": Section("Verdict on restorations", by_default=False, one_thread=True),
+    "honesty": Section("Reliable results that are wrong", by_default=False, one_thread=True),
+    "error_bars": Section("Standard deviations", by_default=False, page="verdicts.md", one_thread=True),
+    "reproduction": Section("The paper's tables", by_default=False, one_thread=True),
 }
 
 
@@ -140,12 +144,15 @@ def main(arguments: list[str] | None = None) -> None:
         for path, page in pages().items():
             path.write_text(page, encoding="utf-8")
         return
-    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", os.cpu_count() or 1)))
+    threads = int(os.environ.get("OMP_NUM_THREADS", os.cpu_count() or 1))
+    torch.set_num_threads(threads)
+    warnings.simplefilter("ignore", rsv.RestorationWarning)  # the figures contain the verdict, or the gain itself
     text = [harness.machine_line(harness.machine())]
     print(text[0])
     options.out.mkdir(parents=True, exist_ok=True)
     for name in options.only:
         section, begin = module_of(name), time.perf_counter()
+        torch.set_num_threads(1 if SECTIONS[name].one_thread else threads)
         try:
             rows = section.rows(options)
         except ModuleNotFoundError as error:

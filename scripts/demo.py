@@ -11,19 +11,17 @@ import math
 import shlex
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
-from benchmarks.resolution_chart import resolution_chart
+from benchmarks.resolution_chart import SCENES
 from rich.console import Console
-from torch import Tensor
 
 import rsvib_torch as rsv
 from rsvib_torch.commands.answers import write_detection
 from rsvib_torch.commands.terminal import warnings_in_one_line, working
-from rsvib_torch.datasets import city_and_fields
 from rsvib_torch.files.atomic import whole_folder
 from rsvib_torch.report import Report, write_report_page
 from rsvib_torch.text import text_table
@@ -34,10 +32,6 @@ FULL_SCALE, NOISE = 4095, 0.003
 MARGIN = 32  # px of scene around the frame, on every side
 RIM = 32  # px at the border that are not evaluated, because they are partly outside the frame
 QUALITY = {"psnr_before": 2, "psnr_after": 2, "ssim_before": 4, "ssim_after": 4}  # with the digits that are shown
-SCENES: dict[str, Callable[[int, int, int], Tensor]] = {
-    "chart": lambda height, width, seed: resolution_chart(height, width, seed=seed),
-    "city": city_and_fields,
-}
 
 
 def compare(truth: rsv.Vibration, detected: rsv.Vibration) -> list[dict[str, Any]]:

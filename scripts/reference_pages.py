@@ -7,16 +7,15 @@ table in results/reason.py. A test fails if the pages are out of date.
 
 import argparse
 import inspect
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
-import griffe
 import harness
-import typer
 from architecture import table_of_packages
 
 from rsvib_torch.checks.values import fields_of, members_of
+from rsvib_torch.commands.flat_command import option_name
 from rsvib_torch.commands.main import app
 from rsvib_torch.motion.timing import SensorSection
 from rsvib_torch.options import METHOD_OPTIONS, OpticsOptions, RestorationOptions, ToneOptions, WindowOptions
@@ -57,13 +56,6 @@ square brackets are omitted where they do not apply. [Verdicts](verdicts.md) exp
 """
 
 
-def documented(thing: object) -> dict[str, str]:
-    """Descriptions of the arguments or attributes in a docstring, by name."""
-    sections = griffe.Docstring(inspect.getdoc(thing) or "").parse("google", warnings=False)
-    kinds = (griffe.DocstringSectionKind.parameters, griffe.DocstringSectionKind.attributes)
-    return {entry.name: entry.description for section in sections if section.kind in kinds for entry in section.value}
-
-
 def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     """A Markdown table of texts of docstrings."""
     return harness.table(
@@ -95,13 +87,13 @@ def type_text(annotation: object) -> str:
     return " or ".join(words)
 
 
-def key_table(group: Any, keys: Iterable[str] = (), meaning: Mapping[str, str] | None = None) -> list[str]:
-    """Table of the keys of a group of options or section, by default of all; ``meaning`` describes fields without."""
+def key_table(group: Any, keys: Iterable[str] = ()) -> list[str]:
+    """Table of the keys of a group of options or section, by default of all."""
     rows = []
     for name in keys or fields_of(group):
         field = fields_of(group)[name]
         shown = "required" if field.is_required() else value_text(field.get_default(call_default_factory=True))
-        rows.append([f"`{name}`", type_text(field.annotation), shown, field.description or (meaning or {})[name]])
+        rows.append([f"`{name}`", type_text(field.annotation), shown, field.description])
     return table(("key", "type", "default", "meaning"), rows)
 
 
@@ -127,12 +119,8 @@ def parameter_row(parameter: inspect.Parameter) -> list[str]:
     choices = get_args(types[0]) or (types if isinstance(types[0], str) else ())
     choices = [choice for choice in choices if isinstance(choice, str)]
     value = info.metavar or "|".join(choices) or names.get(getattr(types[0], "__name__", ""), "TEXT")
-    named = [info.default, *(info.param_decls or ())]  # typer takes the first name in an annotation for a default
-    option = next((name for name in named if isinstance(name, str)), "--" + parameter.name.replace("_", "-"))
-    if isinstance(info, typer.models.ArgumentInfo):
-        text = parameter.name.upper()
-    else:
-        text = option if types == [bool] else f"{option} {value}"
+    option = option_name(parameter)
+    text = parameter.name.upper() if option is None else option if types == [bool] else f"{option} {value}"
     required = parameter.default is inspect.Parameter.empty
     stated = "" if parameter.default in (None, False) else f"`{parameter.default}`"
     default = info.show_default if isinstance(info.show_default, str) else stated
@@ -150,7 +138,7 @@ def command_page() -> str:
         words = [
             each.name.upper() if each.default is inspect.Parameter.empty else f"[{each.name.upper()}]"
             for each in parameters
-            if isinstance(get_args(each.annotation)[1], typer.models.ArgumentInfo)
+            if option_name(each) is None
         ]
         lines += [f"## rsvib {name}", "", "```text", " ".join(["rsvib", name, *words, "[OPTIONS]"]), "```", ""]
         lines += [inspect.getdoc(command.callback) or "", ""]

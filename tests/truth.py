@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from benchmarks import independent_camera
-from benchmarks.independent_camera import Array
+from benchmarks.independent_camera import Array, decibel  # noqa: F401 - tests import it from here
 from scipy import ndimage
 from torch import Tensor
 
@@ -99,9 +99,3 @@ def tone_errors(vibration: Any, motion: Motion) -> Tensor:
 def crop(scene: Array, margin: int = MARGIN) -> Array:
     """The part of the scene in frames of a camera at rest."""
     return scene[margin:-margin, margin:-margin]
-
-
-def decibel(image: Array, truth: Array, rim: int = 32) -> float:
-    """PSNR in dB for full scale 1, excluding a rim."""
-    error = (np.asarray(image, dtype=np.float64) - truth)[..., rim:-rim, rim:-rim]
-    return float(-10 * np.log10(np.mean(error**2)))

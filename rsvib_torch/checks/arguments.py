@@ -19,7 +19,7 @@ from pydantic import ConfigDict, Field, GetPydanticSchema, Strict, TypeAdapter
 from pydantic_core import core_schema
 from torch import Tensor
 
-from rsvib_torch.checks.values import MAX_NUMBER, Number, check_choice, described, members_of, validated, without_alias
+from rsvib_torch.checks.values import MAX_NUMBER, Number, check_choice, described, members_of, validated
 from rsvib_torch.text import one_line, quoted
 
 P = ParamSpec("P")
@@ -169,12 +169,12 @@ def checked_methods(kind: type[R]) -> type[R]:
 
 
 def check_fields(value: Any) -> None:
-    """Check the fields of a dataclass against their annotations; lists become tuples, tensors are copied."""
+    """Check the fields of a dataclass against their annotations; lists become tuples, tables and tensors are copied."""
     kinds = hints_of(value.__class__)
     for name, given in tuple(vars(value).items()):
         made = _checked(name, given, kinds[name], finite=False)
         made = made.clone() if isinstance(made, Tensor) else made
-        if isinstance(made, (tuple, Tensor)) and not isinstance(given, tuple):
+        if isinstance(made, (tuple, dict, Tensor)) and not isinstance(given, tuple):
             object.__setattr__(value, name, made)
 
 
@@ -207,24 +207,20 @@ def _checked(name: str, value: object, kind: object, *, finite: bool = True) -> 
 def _adapter(kind: object, finite: bool) -> tuple[TypeAdapter[object] | None, tuple[object, ...]]:
     """The check of an annotation, None where the function converts the value itself; and the members of a union."""
     members = members_of(kind)
-    made_by_function = any(np.ndarray in (member, get_origin(member)) for member in members) and len(members) > 1
-    if made_by_function or any(getattr(member, "_is_protocol", False) for member in members):
+    if np.ndarray in members:
         return None, members
     return TypeAdapter(_bounded(kind, finite), config=ConfigDict(strict=True, allow_inf_nan=not finite)), members
 
 
 def _bounded(kind: Any, finite: bool) -> Any:  # noqa: PLR0911
     """The annotation without numbers beyond all physical quantities, with lists in place of tuples, for pydantic."""
-    kind = without_alias(kind)
     if kind is float and finite:
         return Number
     if kind is int:
         return Annotated[int, Field(ge=-(2**63), le=2**63 - 1)]
-    if kind in (Any, Self) or isinstance(kind, TypeVar) or getattr(kind, "_is_protocol", False):
+    if kind in (Any, Self):
         return object
-    if get_origin(kind) in (os.PathLike, np.ndarray) or (
-        isinstance(kind, type) and kind not in _PLAIN and get_origin(kind) is None
-    ):
+    if get_origin(kind) is os.PathLike or (isinstance(kind, type) and kind not in _PLAIN and get_origin(kind) is None):
         made_by = f"{kind.__name__} ({kind._MADE_BY})" if hasattr(kind, "_MADE_BY") else None
         of_class = core_schema.is_instance_schema(get_origin(kind) or kind, cls_repr=made_by)
         return Annotated[object, GetPydanticSchema(lambda source, handler: of_class)]

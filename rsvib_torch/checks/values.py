@@ -9,7 +9,7 @@ translates what it reports.
 import inspect
 import json
 import types
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache, wraps
 from importlib import import_module
 from pathlib import Path
@@ -30,7 +30,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from rsvib_torch.files.reading import Table, read_text
-from rsvib_torch.text import one_line, quoted
+from rsvib_torch.text import one_line, printable, quoted
 
 Value = TypeVar("Value")
 
@@ -164,21 +164,11 @@ def _options_at(group: object, keys: Sequence[str | int]) -> list[str]:
 
 def members_of(annotation: object) -> tuple[object, ...]:
     """Members of a union without their bounds, and without None."""
-    annotation = without_alias(annotation)
     if get_origin(annotation) is Annotated:
         return members_of(get_args(annotation)[0])
     if get_origin(annotation) in (Union, types.UnionType):
         return tuple(member for part in get_args(annotation) for member in members_of(part))
     return () if annotation is type(None) else (annotation,)
-
-
-def without_alias(annotation: Any) -> Any:
-    """The annotation that a type alias stands for, as ``NDArray`` of NumPy 2.5 is one."""
-    alias = get_origin(annotation) or annotation
-    if type(alias).__name__ != "TypeAliasType":
-        return annotation
-    arguments = get_args(annotation)
-    return alias.__value__[arguments] if arguments else alias.__value__
 
 
 def needed_package(name: str, purpose: str, extra: str) -> types.ModuleType:
@@ -209,11 +199,7 @@ Count = Annotated[int, Field(ge=1, le=2**31)]
 
 
 class MistakesError(ValueError):
-    """Mistakes in one file; ``lines`` has one line for each."""
-
-    def __init__(self, lines: Iterable[str]) -> None:
-        self.lines = tuple(lines)
-        super().__init__("\n".join(self.lines))
+    """Mistakes in one file, with a line of text for each."""
 
 
 # unknown keys are refused, and values are not converted; the text below a field is its description
@@ -305,18 +291,14 @@ def _with_options(text: str, group: object) -> str:
     return "\n".join([before.removesuffix("\n"), *listed, *after.splitlines()[1:]])
 
 
-def validate(group: type[_Result], data: Mapping[str, object], source: str, path: str = "") -> _Result:
-    """Parsed TOML or JSON as a group of options; an error has a line for each mistake in ``source``.
-
-    ``path`` names the table of the source that ``data`` is.
-    """
+def validate(group: type[_Result], data: Mapping[str, object], source: str) -> _Result:
+    """Parsed TOML as a group of options; an error has a line for each mistake in ``source``."""
     try:
         return TypeAdapter(group).validate_python(data, context={"file": source})
     except ValidationError as error:
-        mistakes = mistakes_of(error, data, path, group)
-        lines = [f"{source}: {one_line(mistake)}" for mistake in mistakes]
+        lines = [f"{printable(source)}: {one_line(mistake)}" for mistake in mistakes_of(error, data, group=group)]
         more = [f"{source}: {len(lines) - _MAX_LINES} more mistakes"] if len(lines) > _MAX_LINES else []
-        raise MistakesError([*lines[:_MAX_LINES], *more]) from error
+        raise MistakesError("\n".join([*lines[:_MAX_LINES], *more])) from error
 
 
 def read_json(path: Path, what: str) -> Table:

@@ -54,26 +54,29 @@ def stack_answer(frames: Path, found: detection.DetectionResult, pixel_size: flo
     return answer
 
 
-def warn_of_restoration(result: stacks.RestoredFrames) -> None:
-    """Print a warning if there is nothing to restore, or if restoration does not help or may not."""
-    kept = "the frames are written unchanged"
+def restoration_of(run: stacks.StackReport) -> tuple[list[str], Table]:
+    """What a run restored, as lines and as data, with warnings; of a single window with its verdict."""
+    stored = stacks.read_manifest(run.manifest)
+    if run.windows != 1 or run.first is None or run.first.restoration is None:
+        warn_of_failures(stored)
+        return [run.summary(), *stored.lines()[1][1:]], stored.totals()
+    result, record = run.first.restoration, stored.windows[0]
+    verdict = result.verdict
+    # 1. A warning if there is nothing to restore, or if restoration does not help or may not.
+    unchanged = "the frames are written unchanged"
     if not result.moves:
-        warn(f"no vibration was found that can be removed: {kept}")
-    elif result.verdict is not None and result.verdict.overall in ("partly", "worse"):
-        unchanged = "" if result.restored else f"; {kept}, --force writes the restored ones"
-        warn(result.verdict.sentence + unchanged)
-
-
-def restoration_lines(result: stacks.RestoredFrames, count: int) -> list[str]:
-    """What was restored of ``count`` frames and its gain, and which axes were left unchanged and why."""
-    frames = number_of(count, "frame") if len(result.frames) == count else f"1 image of {number_of(count, 'frame')}"
-    if not result.restored:
-        lines = [f"{number_of(count, 'frame')} unchanged"]
-    else:
+        warn(f"no vibration was found that can be removed: {unchanged}")
+    elif verdict is not None and verdict.overall in ("partly", "worse"):
+        warn(verdict.sentence + ("" if result.restored else f"; {unchanged}, --force writes the restored ones"))
+    # 2. What was restored and its gain, and which axes were left unchanged and why.
+    count = number_of(record.last + 1, "frame")
+    lines = [f"{count} unchanged"]
+    if result.restored:
         *most, last = result.restored_axes()
+        frames = count if len(result.frames) == record.last + 1 else f"1 image of {count}"
         lines = [f"{frames} restored along {', '.join(most)}{' and ' * bool(most)}{last}"]
-    if result.verdict is not None:
-        lines.append(result.verdict.sentence)
+    if verdict is not None:
+        lines.append(verdict.sentence)
     elif result.restored:
         lines.append("cannot determine whether restoration helps: no two frames show the same scene")
     elif not result.moves:
@@ -82,19 +85,15 @@ def restoration_lines(result: stacks.RestoredFrames, count: int) -> list[str]:
         is_above = reason.code == "axis_not_reliable"  # its reasons were printed before
         text = f"{reason.axis} unchanged: its vibration is not reliable, see the reasons above"
         lines.append(text if is_above else str(reason))
-    return [wrapped(line) for line in lines]
-
-
-def restoration_of(run: stacks.StackReport) -> tuple[list[str], Table]:
-    """What a run restored, as lines and as data, with warnings; of a single window with its verdict."""
-    stored = stacks.read_manifest(run.manifest)
-    if run.windows == 1 and run.first is not None and run.first.restoration is not None:
-        first = run.first.restoration
-        warn_of_restoration(first)
-        lines = restoration_lines(first, run.first.window.last + 1)
-        return lines + stored.losses, reports.restoration_data(first)
-    warn_of_failures(stored)
-    return [run.summary(), *stored.lines()[1][1:]], stored.totals()
+    data = {
+        "frames": record.frames,
+        "axes": result.restored_axes(),
+        "left_alone": [reason.to_dict() for reason in record.left_alone],
+        "outcome": record.outcome,
+        "predicted_gain_db": record.predicted_gain,
+        "summary": None if verdict is None else verdict.sentence,
+    }
+    return [wrapped(line) for line in lines] + stored.losses, data
 
 
 def next_step(sentence: str, *command: object) -> str:

@@ -17,7 +17,7 @@ from rsvib_torch.files.atomic import whole_file
 from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.cameras import camera_mode, find_cameras
 from rsvib_torch.motion.timing import SensorSection, SensorTiming
-from rsvib_torch.text import measured_text, number_of, printable, text_table
+from rsvib_torch.text import measured_text, number_of, one_line, printable, text_table
 
 if TYPE_CHECKING:
     from rsvib_torch.io.stack_info import StackInfo
@@ -159,7 +159,7 @@ def _check_complete(values: Table, info: "StackInfo", rows: int, proposal: str) 
             hint += f" Here it is less than {1e6 / (values['frame_rate'] * rows):.4g} us.{proposal}"
         mistakes.append(hint)
     if mistakes:
-        raise MistakesError(mistakes)
+        raise MistakesError("\n".join(one_line(mistake, 1000) for mistake in mistakes))
 
 
 def _check_timing(timing: SensorTiming, rows: int) -> None:

@@ -101,7 +101,7 @@ def _parameter(name: str, annotation: object, default: object, form: Table) -> i
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
 
 
-def _option_name(parameter: inspect.Parameter) -> str | None:
+def option_name(parameter: inspect.Parameter) -> str | None:
     """The option of the command line that states a parameter; None of an argument."""
     info = get_args(parameter.annotation)[1]
     if isinstance(info, ArgumentInfo):
@@ -129,7 +129,7 @@ def flat_command(name: str, command: Callable[[Group], Answer]) -> Callable[...,
     """A command as typer calls it: its options are flat, and its answer is printed."""
     (group,) = (parameter.annotation for parameter in inspect.signature(command, eval_str=True).parameters.values())
     fields = list(_parameters(group))
-    names = {one.name: option for _, one in fields if (option := _option_name(one)) is not None}
+    names = {one.name: option for _, one in fields if (option := option_name(one)) is not None}
 
     def flat(**given: object) -> None:
         values: Table = {}

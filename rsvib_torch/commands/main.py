@@ -107,7 +107,7 @@ def run_command(arguments: Sequence[str]) -> int:
 def _lines_of(error: Exception) -> Sequence[str]:
     """What is printed about an error: one line, or one for each mistake in a file."""
     if isinstance(error, MistakesError):
-        return error.lines
+        return str(error).splitlines()
     if isinstance(error, OSError) and error.strerror:
         return [f"{error.filename}: {error.strerror}" if error.filename else error.strerror]
     if isinstance(error, (OSError, ValueError, TypeError, ModuleNotFoundError)):

@@ -92,11 +92,9 @@ class CameraOptions:
         """Configuration file and the options that replace its keys, or these alone and what the frames state."""
         sensor = self.sensor
         if self.config is None and frames is not None and "row_time" in sensor:
-            exposure = None if "exposure_time" in sensor else stated_exposure(frames)
-            sensor = sensor | ({} if exposure is None else {"exposure_time": exposure})
-            if "exposure_time" in sensor and "frame_rate" not in sensor:
-                frame_rate = rate_of_file(frames)
-                sensor = sensor | ({} if frame_rate is None else {"frame_rate": frame_rate})
+            for name, stated_by_file in (("exposure_time", stated_exposure), ("frame_rate", rate_of_file)):
+                value = None if name in sensor else stated_by_file(frames)
+                sensor = sensor if value is None else sensor | {name: value}
         missing = [option for name, option in _TIMES.items() if name not in sensor]
         if self.config is None and missing:
             raise ValueError(

@@ -9,7 +9,6 @@ from .plots import save_figure as save_figure
 from .plots import windows_figure as windows_figure
 from .results import motion_columns as motion_columns
 from .results import read_vibration as read_vibration
-from .results import restoration_data as restoration_data
 from .results import write_columns as write_columns
 from .results import write_offsets as write_offsets
 from .results import write_table as write_table

@@ -51,9 +51,6 @@ _OFFSET_TIME = "exposure start of the rows in the earlier frame (ms)"
 _QUALITY_COLOURS = LinearSegmentedColormap.from_list("quality", ["#f0a030", "#9cc3e0", _X_COLOUR])  # poor ... good
 
 
-Panels = Array  # (rows, columns) of ``Axes``
-
-
 class _Drawing(Figure):
     """A figure that notebooks show without pyplot."""
 
@@ -88,8 +85,8 @@ def plain_axes(panel: Axes, x: str = "", y: str = "", *, title: str = "", headin
     panel.set_title(heading or title, **(_HEADING if heading else _TITLE))
 
 
-def _panels(width: float, height: float, rows: int = 1, columns: int = 1, **grid: Any) -> tuple[Figure, Panels]:
-    """A figure of a size in inches, and its panels (rows, columns)."""
+def _panels(width: float, height: float, rows: int = 1, columns: int = 1, **grid: Any) -> tuple[Figure, Array]:
+    """A figure of a size in inches, and its ``Axes`` (rows, columns)."""
     figure = _Drawing(figsize=(width, height), layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False, **grid)
 

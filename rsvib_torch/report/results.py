@@ -13,10 +13,8 @@ from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.values import check_single
 from rsvib_torch.detection import DetectionResult, MotionDetection
 from rsvib_torch.files.atomic import whole_file
-from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.results.presentation import Result, plain_values
-from rsvib_torch.stacks import RestoredFrames
 
 
 @checks_arguments
@@ -127,16 +125,3 @@ def motion_columns(result: MotionDetection, timing: SensorTiming) -> dict[str, l
     columns = {"time": at, "x": moved[:, 0], "y": moved[:, 1]}
     columns |= {f"std_{name}": np.interp(at, rows, stds[:, axis]) for axis, name in enumerate("xy")}
     return {name: [f"{v:.{9 if name == 'time' else 5}f}" for v in values] for name, values in columns.items()}
-
-
-def restoration_data(result: RestoredFrames) -> Table:
-    """What was restored, and whether that helped, as values that JSON can store."""
-    verdict = result.verdict
-    return {
-        "frames": "restored" if result.restored else "as taken",
-        "axes": result.restored_axes(),
-        "left_alone": plain_values(result.left_alone),
-        "outcome": None if verdict is None else verdict.overall,
-        "predicted_gain_db": None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),
-        "summary": None if verdict is None else verdict.sentence,
-    }

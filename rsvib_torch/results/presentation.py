@@ -16,6 +16,7 @@ from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, get_args, get_origin
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -42,11 +43,9 @@ def _decoded(kind: object, value: object, path: str, missing: float) -> object:
         return _tensor(value, path, missing)
     if isinstance(kind, type) and hasattr(kind, "__dataclass_fields__"):
         return decode(kind, value, path)
-    if origin is dict and isinstance(value, dict):
-        return {key: _decoded(parts[1], entry, f"{path}.{key}", missing) for key, entry in value.items()}
     if origin is tuple and hasattr(parts[0], "__dataclass_fields__") and isinstance(value, list):
         return tuple(decode(parts[0], entry, f"{path}[{number}]") for number, entry in enumerate(value))
-    return value if kind is Any else _tuples(value)
+    return _tuples(value)
 
 
 def decode(kind: type[R], value: object, path: str) -> R:
@@ -74,17 +73,14 @@ def decode(kind: type[R], value: object, path: str) -> R:
 
 
 def _tensor(value: object, path: str, missing: float) -> Tensor:
-    def filled(entry: object) -> object:
-        return [filled(part) for part in entry] if isinstance(entry, list) else missing if entry is None else entry
-
-    values = filled(value)
     try:
-        tensor = torch.tensor(values, device="cpu")
-        if tensor.is_floating_point() or not tensor.numel():
-            tensor = torch.tensor(values, dtype=torch.float64, device="cpu")
+        array = np.array(value)
+        if array.dtype.kind in "Ou":  # with None, which becomes NaN, or beyond the integers of PyTorch
+            array = np.array(value, dtype=np.float64)
+            array[np.isnan(array)] = missing
+        return torch.from_numpy(array)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: expected numbers in lists of equal lengths: {error}") from error
-    return tensor
 
 
 def _tuples(value: object) -> object:
@@ -194,8 +190,9 @@ class Summarised:
     """A class whose objects print as their summary, in the terminal and in notebooks."""
 
     def summary(self) -> str:
-        """The result in a few lines."""
-        raise NotImplementedError
+        """The result in a few lines: here the shapes of its tensors and its other values."""
+        shown = {n: f"tensor {tuple(v.shape)}" if isinstance(v, Tensor) else str(v) for n, v in vars(self).items()}
+        return "\n".join([type(self).__name__, *(f"  {name}: {text}" for name, text in shown.items())])
 
     def __str__(self) -> str:
         return self.summary()
@@ -214,7 +211,7 @@ class Result(Summarised):
 
     The decorator of the class needs ``repr=False``, so that objects print as their summary. Arguments of the class:
     ``units``, the units of its fields, which are written into files; ``shapes``, the axes of its tensors as in
-    ``check_shapes``, where ``"..."`` alone marks a tuple or table with one entry for each result of a batch; and
+    ``check_shapes``, where ``"..."`` alone marks a tuple with one entry for each result of a batch; and
     ``file_format``, the first entry of its files, by default the name of the class.
     """
 
@@ -244,12 +241,6 @@ class Result(Summarised):
             value = getattr(self, name, None)
             if isinstance(value, Tensor) and not value.is_floating_point():
                 raise TypeError(f"{name} must be a floating-point tensor, got {value.dtype}")
-
-    def summary(self) -> str:
-        """The result in a few lines: here the shapes of its tensors and its other values."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
-        shown = {name: f"tensor {tuple(v.shape)}" if isinstance(v, Tensor) else str(v) for name, v in values.items()}
-        return "\n".join([type(self).__name__, *(f"  {name}: {text}" for name, text in shown.items())])
 
     def _changed(self, **values: object) -> Self:
         """The result with some values replaced, without checks."""
@@ -282,7 +273,7 @@ class Result(Summarised):
         selected: Table = {}
         for name, value in self._fields_of_batch().items():
             if not isinstance(value, Tensor) or value.ndim >= len(self.shapes[name].split()):  # others are common
-                selected[name] = {k: v[index] for k, v in value.items()} if isinstance(value, dict) else value[index]
+                selected[name] = value[index]
         return self._changed(**selected)
 
     @classmethod
@@ -293,8 +284,6 @@ class Result(Summarised):
 
         def joined(values: Sequence[Any]) -> object:
             first = values[0]
-            if isinstance(first, dict):
-                return {key: joined([value[key] for value in values]) for key in first}
             if isinstance(first, Tensor):
                 return torch.stack(values)  # type: ignore[arg-type]
             return type(first).stacked(values) if isinstance(first, Result) else tuple(values)
@@ -348,8 +337,6 @@ class Result(Summarised):
                 values[name] = function(value)
             elif isinstance(value, Result):
                 values[name] = value.mapped(function)
-            elif isinstance(value, dict):
-                values[name] = {key: function(one) if isinstance(one, Tensor) else one for key, one in value.items()}
         return self._changed(**values)
 
     def to(self, device: torch.device | str) -> Self:

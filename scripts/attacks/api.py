@@ -119,25 +119,21 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     components = torch.zeros(2, 3, dtype=torch.float64)
     # values of the parameters of all functions and methods, by name
     pool: dict[str, Any] = {"frames": frames, "timing": timing, "vibration": vibration, "motion": recorded, **BANDS}
-    pool |= {"recorded": recorded, "offsets": (-0.001, 0.001), "camera": camera, "info": info}
-    pool |= {"manifest": manifest, "detected": detected, "detection": detected, "result": detected}
-    pool |= {"restored": restored, "figure": figure, "psf": psf}
+    pool |= {"recorded": recorded, "offsets": (-0.001, 0.001), "camera": camera, "info": info, "manifest": manifest}
+    pool |= {"detected": detected, "detection": detected, "result": detected, "detections": [detected]}
+    pool |= {"restored": restored, "figure": figure, "psf": psf, "measured": path, "curves": {"raw": [curve]}}
     pool |= {"scene": scene, "noise": sensor_noise, "image": image, "reference": image, "roi": edge, "rim": 4}
-    pool |= {"data_range": 1.0, "raw": frames[0], "measured": path, "truth": path * 0.9, "curves": {"raw": [curve]}}
     pool |= {"times": times, "starts": times, "later_starts": times + 0.01, "start": times, "end": times + 0.01}
     pool |= {"exposure_time": 6e-4, "duration": 6e-4, "interval": 0.0104, "first": 0.0, "last": 0.03, "highest": 500.0}
     pool |= {"order": [1, 0], "signs": [1.0, -1.0], "device": "cpu", "path": stack, "offset": 0.001, "scale": 1.0}
     pool |= {"gain": (1.0, 1.0), "factor": 1.5, "displacement": path, "spacing": 5e-4, "motions": [recorded, recorded]}
     pool |= {"vibrations": [vibration, vibration], "axes": 3, "components": components, "batch_shape": (2,)}
     pool |= {"frequency": torch.tensor([0.1, 0.2], dtype=torch.float64), "num_rows": 96, "num_frames": 3}
-    pool |= {"line_time": 1e-4, "delays": [0.0, 0.04], "num_lines": 100, "exposure_lines": 2.0, "size": (96, 64)}
-    pool |= {"height": 24, "width": 16, "u": times * 10, "v": times * 10, "input": frames[:, None], "index": 0}
+    pool |= {"height": 24, "width": 16, "u": times * 10, "v": times * 10, "input": frames[:, None], "size": (96, 64)}
     pool |= {"count": 2, "shape": (3, 96, 64), "dtype": "float32", "frame": frames[0].numpy(), "x": scene}
-    pool |= {"y": frames[0], "scene_shape": (160, 128), "tones": None, "flicker_frequency": 1000.0}
-    pool |= {"results": [detected.std] * 2, "images": frames}
-    pool |= {"place": torch.zeros(2)}
-    pool |= {"stated": timing, "agreeing": timing, "row_time": 1e-4, "pixel_size": 5e-6}
-    pool |= {"exposure_times": [1e-3, 2.5e-4], "frame_rate": 30.0, "detections": [detected], "source": stack}
+    pool |= {"y": frames[0], "scene_shape": (160, 128), "tones": None, "flicker_frequency": 1000.0, "raw": frames[0]}
+    pool |= {"place": torch.zeros(2), "delays": [0.0, 0.04], "data_range": 1.0, "source": stack}
+    pool |= {"row_time": 1e-4, "pixel_size": 5e-6, "frame_rate": 30.0}
 
     def call(function: Callable[..., Any], **others: Any) -> Call:
         """A valid call: all parameters, with these values, those of the pool, or their defaults."""

@@ -5,7 +5,6 @@ times are compared, because other load on the machine can only increase them.
 """
 
 import argparse
-import warnings
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -69,9 +68,7 @@ def measure(difficult: Recorded, simple: Recorded, runs: int) -> dict[str, Any]:
         found = rsv.detect_vibration(*recorded)
         works[f"{kind}detection"] = partial(rsv.detect_vibration, *recorded)
         works[f"{kind}restoration"] = partial(rsv.restore, *recorded, found)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", rsv.RestorationWarning)
-        least = {name: float(seconds.min()) for name, seconds in in_turns(works, runs).items()}
+    least = {name: float(seconds.min()) for name, seconds in in_turns(works, runs).items()}
     ratios = {f"{step}_ratio": least[step] / least[f"plain_{step}"] for step in ("detection", "restoration")}
     codes = [reason.code for of_axis in found.findings for reason in of_axis]
     return {"shape": list(difficult[0].shape), **least, **ratios, "reason": codes[0] if codes else ""}

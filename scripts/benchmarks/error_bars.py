@@ -31,7 +31,7 @@ from benchmarks.honesty_camera import FINER, MARGIN, Layer, fine_shape, seen_by_
 from benchmarks.honesty_cases import FRAME_PERIOD, Case, Generator, log_uniform, moving, record, tones_of, wave
 from benchmarks.honesty_scenes import city
 from benchmarks.independent_camera import Shake, closed
-from harness import Rows, one_thread, table
+from harness import Rows, table
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d, map_coordinates
@@ -45,7 +45,7 @@ sys.path += [str(_TESTS), str(_TESTS / "row_time")]
 
 from motion_truth import common_warp, rms  # noqa: E402
 from test_calibrate import HEIGHT, WIDTH, blink, record_frames, shaded, sine  # noqa: E402
-from truth import Curve, draw_scene, take_frames  # noqa: E402
+from truth import Curve, draw_scene, recorded  # noqa: E402
 
 Array = NDArray[np.float64]
 Error = tuple[str, float, float, float]  # quantity, error, standard deviation, bound or NaN
@@ -171,13 +171,6 @@ def tones(kind: str, number: int, size: int) -> Iterator[Error]:
             yield f"{name} {quantity}", error, std, least
 
 
-def recorded(motion: Curve, count: int, draw: Generator) -> torch.Tensor:
-    """Frames of a drawn scene with noise."""
-    scene = draw_scene(ROWS + 80, COLUMNS + 80, int(draw.integers(1000)))
-    clean = take_frames(scene, TIMING, motion, count)
-    return torch.from_numpy(clean + NOISE * draw.standard_normal(clean.shape)).float()
-
-
 # Free motion
 
 
@@ -210,7 +203,8 @@ def free_motion(kind: str, number: int) -> Iterator[Error]:
     """Errors of the rows of each reliable axis, and of what differs between frames, rms over the rows."""
     draw = generator_of(kind, number)
     motion = drawn(kind.removeprefix("free motion: "), draw)
-    found = rsv.detect_motion(recorded(motion, FRAMES, draw), TIMING)
+    frames = recorded((ROWS, COLUMNS), TIMING, motion, FRAMES, NOISE, seed=int(draw.integers(2**32)))
+    found = rsv.detect_motion(frames, TIMING)
     error = found.displacement.numpy() - motion.displacement(found.times.numpy())
     error = (error - error.mean((0, 1)))[:, ::16]
     error, stds = (values[..., found.reliable.numpy()].ravel() for values in (error, found.std.numpy()[:, ::16]))
@@ -303,21 +297,20 @@ def errors_of(kind: str, number: int, size: int) -> Iterator[Error]:
 
 def rows(options: argparse.Namespace) -> Rows:
     figures: Rows = []
-    with one_thread():
-        for kind in options.bar_kinds:
-            found: dict[str, list[tuple[float, float, float]]] = {}
-            for number in range(options.bar_recordings):
-                for quantity, *values in errors_of(kind, number, options.bar_size):
-                    found.setdefault(quantity, []).append(tuple(values))
-            for quantity, values in found.items():
-                error, std, bound = np.array(values).T
-                z = np.abs(error / std)
-                within = {f"within_{share}": float(np.mean(z < limit)) for share, limit in WITHIN.items()}
-                spread = {"z": float(rms(z[:, None])[0]), **within, "largest": float(z.max())}
-                least = {"std_over_bound": float(np.median(std / bound)), "rms": float(rms(error[:, None])[0])}
-                of_bound = float(rms((error / bound)[:, None])[0]) if np.isfinite(bound).all() else math.nan
-                row = {"kind": kind, "quantity": quantity, "number": len(z)}
-                figures.append(row | spread | least | {"error_over_bound": of_bound})
+    for kind in options.bar_kinds:
+        found: dict[str, list[tuple[float, float, float]]] = {}
+        for number in range(options.bar_recordings):
+            for quantity, *values in errors_of(kind, number, options.bar_size):
+                found.setdefault(quantity, []).append(tuple(values))
+        for quantity, values in found.items():
+            error, std, bound = np.array(values).T
+            z = np.abs(error / std)
+            within = {f"within_{share}": float(np.mean(z < limit)) for share, limit in WITHIN.items()}
+            spread = {"z": float(rms(z[:, None])[0]), **within, "largest": float(z.max())}
+            least = {"std_over_bound": float(np.median(std / bound)), "rms": float(rms(error[:, None])[0])}
+            of_bound = float(rms((error / bound)[:, None])[0]) if np.isfinite(bound).all() else math.nan
+            row = {"kind": kind, "quantity": quantity, "number": len(z)}
+            figures.append(row | spread | least | {"error_over_bound": of_bound})
     return figures
 
 

@@ -23,11 +23,12 @@ from benchmarks.independent_camera import (
     Shake,
     after_optics,
     closed,
+    decibel,
     still_image,
     take_frames,
 )
-from benchmarks.pipeline import SCENES
-from harness import Rows, one_thread, table_of
+from benchmarks.resolution_chart import SCENES
+from harness import Rows, table_of
 from scipy import ndimage
 
 import rsvib_torch as rsv
@@ -49,12 +50,6 @@ FRAMES = (2, 4, 8)
 SHAKE = Shake(np.array([[3.1], [5.2]]), np.array([[90.0], [61.0]]), np.array([[0.4], [1.3]]), np.zeros(2))
 WIDTHS = (0.3, 0.5, 0.7, 1.0)  # of the Gaussian of shift-and-add, points of the half-pixel grid
 FRACTIONS = (0.4, 0.6, 0.8, 1.0)  # sizes of the drops of drizzle
-
-
-def decibel(image: Array, truth: Array, rim: int = RIM) -> float:
-    """PSNR in dB for full scale 1, without a rim."""
-    error = (np.asarray(image, dtype=np.float64) - truth)[..., rim:-rim, rim:-rim]
-    return float(-10 * np.log10(np.mean(error**2)))
 
 
 def interpolated(image: Array) -> Array:
@@ -193,16 +188,16 @@ def cases(name: str, options: argparse.Namespace, sigma: float) -> Rows:
                 "sigma": sigma,
                 "noise": noise,
                 "frames": count,
-                "still": decibel(taken.still(noise, count), taken.half),
-                "endless": decibel(interpolated(taken.pixels), taken.half),
-                "joint": decibel(interpolated(before), taken.half),
-                "finer": decibel(finer, taken.half),
-                "joint_pixels": decibel(before, taken.pixels),
-                "finer_pixels": decibel(finer[::2, ::2], taken.pixels),
+                "still": decibel(taken.still(noise, count), taken.half, RIM),
+                "endless": decibel(interpolated(taken.pixels), taken.half, RIM),
+                "joint": decibel(interpolated(before), taken.half, RIM),
+                "finer": decibel(finer, taken.half, RIM),
+                "joint_pixels": decibel(before, taken.pixels, RIM),
+                "finer_pixels": decibel(finer[::2, ::2], taken.pixels, RIM),
             }
             for peer, images in (("drizzle", drizzled), ("added", shift_and_add)):
-                values = [decibel(image, taken.half) for image in images(frames, taken.timing, detection.vibration)]
-                row[peer] = max(values, default=float("nan"))
+                shown = images(frames, taken.timing, detection.vibration)
+                row[peer] = max((decibel(image, taken.half, RIM) for image in shown), default=float("nan"))
             found.append(row)
     return found
 
@@ -249,8 +244,9 @@ def conditions(options: argparse.Namespace) -> Rows:
                 )
             counted = below if chosen else np.ones_like(taken.half, dtype=bool)
             still = taken.still(noise, max(FRAMES))
+            all_points = 10 * np.log10(1 / counted.mean())  # dB; the error of others is zero
             figures = {
-                kind: decibel(np.where(counted, image, taken.half), taken.half) - 10 * np.log10(1 / counted.mean())
+                kind: decibel(np.where(counted, image, taken.half), taken.half, RIM) - all_points
                 for kind, image in (("still", still), ("joint", interpolated(before)), ("finer", finer))
             }
             found.append({"condition": name, "noise": noise, "warned": len(caught) > 0, **figures})
@@ -259,10 +255,8 @@ def conditions(options: argparse.Namespace) -> Rows:
 
 def rows(options: argparse.Namespace) -> Rows:
     """PSNR on half pixels and on pixels, for all scenes, optics, noise levels and numbers of frames."""
-    with one_thread(), warnings.catch_warnings():
-        warnings.simplefilter("ignore", rsv.RestorationWarning)
-        table = [row for name in options.scenes for sigma in OPTICS for row in cases(name, options, sigma)]
-        return [*table, *conditions(options)]
+    table = [row for name in options.scenes for sigma in OPTICS for row in cases(name, options, sigma)]
+    return [*table, *conditions(options)]
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:

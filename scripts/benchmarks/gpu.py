@@ -13,7 +13,6 @@ import argparse
 import itertools
 import statistics
 import time
-import warnings
 from collections.abc import Callable
 from functools import cache
 from typing import Any
@@ -169,14 +168,12 @@ def rows(options: argparse.Namespace) -> Rows:
             results.append({**case, "left_out": "not enough memory"})
             torch.cuda.empty_cache()
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", rsv.RestorationWarning)
-        for size in options.gpu_sizes:
-            add(size, 1, "tracker, dewarp", tracked(size, device), 1)
-        for count, size in itertools.product(options.gpu_stacks, options.gpu_sizes):
-            frames = recordings(size, count, 2, device)
-            for name, work in works_of(frames[0, :, 0] if count == 1 else frames, camera(size)).items():
-                add(size, count, name, work, 2 * count)
+    for size in options.gpu_sizes:
+        add(size, 1, "tracker, dewarp", tracked(size, device), 1)
+    for count, size in itertools.product(options.gpu_stacks, options.gpu_sizes):
+        frames = recordings(size, count, 2, device)
+        for name, work in works_of(frames[0, :, 0] if count == 1 else frames, camera(size)).items():
+            add(size, count, name, work, 2 * count)
     return results
 
 

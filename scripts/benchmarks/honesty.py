@@ -21,14 +21,15 @@ import argparse
 import math
 import time
 import warnings
+from contextlib import suppress
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from benchmarks.honesty_camera import Array
 from benchmarks.honesty_cases import CLASSES, MODELLED, MORE, TIMING_CORRECT, Recording, recording
-from harness import Rows, one_thread, table
-from scipy.ndimage import shift, spline_filter
+from harness import Rows, table
 from scipy.optimize import linear_sum_assignment
 
 import rsvib_torch as rsv
@@ -194,20 +195,18 @@ def judge_axis(found: rsv.DetectionResult, taken: Recording, axis: int) -> dict[
     }
 
 
-def best_constant(image: Array, still: Array, rim: int, steps: int = 4) -> Array:
-    """Displacement (y, x) of a still frame with the smallest difference to an image."""
-    inner = (slice(rim, -rim), slice(rim, -rim))
-    window = np.outer(*(np.hanning(n) for n in image.shape))
-    spectra = [np.fft.rfft2(window * (one - one[inner].mean())) for one in (image, still)]
-    correlation = np.fft.irfft2(spectra[0] * spectra[1].conj(), s=image.shape)
-    peak = np.array(np.unravel_index(correlation.argmax(), image.shape), dtype=float)
-    at = (peak + 0.5 * np.array(image.shape)) % image.shape - 0.5 * np.array(image.shape)
-    coefficients = spline_filter(still, 3)
-    for _ in range(steps):
-        moved = shift(coefficients, at, order=3, mode="mirror", prefilter=False)
-        slope = np.stack([part[inner].ravel() for part in np.gradient(moved)], axis=1)
-        at = at - np.linalg.solve(slope.T @ slope, slope.T @ (image - moved)[inner].ravel())
-    return np.asarray(at)
+def best_constant(image: Array, still: Array, rim: int) -> tuple[float, float]:
+    """Displacement (x, y) of a still frame with which it is most like an image."""
+    inner = np.zeros(image.shape, np.uint8)
+    inner[rim:-rim, rim:-rim] = 1
+    window = np.outer(*(np.hanning(size) for size in image.shape))
+    start, _ = cv2.phaseCorrelate(still.copy(), image.copy(), window)  # OpenCV 5.0 overwrites its arguments
+    moved, criteria = np.eye(2, 3, dtype=np.float32), (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-9)
+    moved[:, 2] = -np.array(start)
+    with suppress(cv2.error):  # they do not correlate: the start remains
+        pair = image.astype(np.float32), still.astype(np.float32)
+        _, moved = cv2.findTransformECC(*pair, moved, cv2.MOTION_TRANSLATION, criteria, inner, 1)
+    return float(-moved[0, 2]), float(-moved[1, 2])
 
 
 def psnr(frames: Array, taken: Recording, stills: list[Array]) -> float:
@@ -215,8 +214,7 @@ def psnr(frames: Array, taken: Recording, stills: list[Array]) -> float:
     rim = int(RIM * frames.shape[-1])
     errors = []
     for number, (frame, still) in enumerate(zip(frames, stills, strict=True)):
-        y, x = best_constant(frame, still, rim)
-        error = frame - taken.still(number, float(x), float(y))
+        error = frame - taken.still(number, *best_constant(frame, still, rim))
         errors.append(np.mean(error[rim:-rim, rim:-rim] ** 2))
     return float(-10 * np.log10(np.mean(errors)))
 
@@ -245,12 +243,11 @@ def judge_case(name: str, number: int, size: int) -> dict[str, Any]:
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    with one_thread():
-        return [
-            judge_case(name, number, options.honesty_size)
-            for name in options.honesty_classes
-            for number in range(options.honesty_cases * MORE.get(name, 1))
-        ]
+    return [
+        judge_case(name, number, options.honesty_size)
+        for name in options.honesty_classes
+        for number in range(options.honesty_cases * MORE.get(name, 1))
+    ]
 
 
 def is_worse(case: dict[str, Any]) -> bool:

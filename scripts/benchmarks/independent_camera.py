@@ -130,6 +130,12 @@ def still_image(scene: Array, size: tuple[int, int], scale: int = 1, offset: tup
     return moved[: POINTS_PER_PX * size[0] : step, : POINTS_PER_PX * size[1] : step]
 
 
+def decibel(image: Any, truth: Array, rim: int = 32) -> float:
+    """PSNR in dB for full scale 1, without a rim."""
+    error = (np.asarray(image, dtype=np.float64) - truth)[..., rim:-rim, rim:-rim]
+    return float(-10 * np.log10(np.mean(error**2)))
+
+
 def mosaic_of(frames: Array, pattern: str) -> Array:
     """Raw frames (T, H, W) behind colour filters from colour frames (T, 3, H, W).
 

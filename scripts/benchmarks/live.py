@@ -36,6 +36,11 @@ BEFORE = 0.3  # s, the vibration is steady before it changes
 WINDOW = 8  # frames of the batch
 
 
+def changing_time(times: NDArray[Any]) -> NDArray[Any]:
+    """Time (..., 2) in s since the vibration along x changes; that along y does not."""
+    return np.maximum(times - BEFORE, 0.0)[..., None] * [1.0, 0.0]
+
+
 @dataclass(frozen=True)
 class Changing:
     """Tones along x and y; that along x may sweep (Hz/s) and grow (doublings per second) after ``BEFORE`` s."""
@@ -45,18 +50,15 @@ class Changing:
 
     def amplitude(self, times: NDArray[Any]) -> NDArray[Any]:
         """(..., 2) px."""
-        later = np.maximum(times - BEFORE, 0.0)
-        return np.stack([AMPLITUDE[0] * 2.0 ** (self.doublings * later), AMPLITUDE[1] + 0 * times], -1)
+        return AMPLITUDE * 2.0 ** (self.doublings * changing_time(times))
 
     def frequency(self, times: NDArray[Any]) -> NDArray[Any]:
         """(..., 2) Hz."""
-        later = np.maximum(times - BEFORE, 0.0)
-        return np.stack([FREQUENCY[0] + self.sweep * later, FREQUENCY[1] + 0 * times], -1)
+        return FREQUENCY + self.sweep * changing_time(times)
 
     def displacement(self, times: NDArray[Any]) -> NDArray[Any]:
         """(..., 2) px."""
-        later = np.maximum(times - BEFORE, 0.0)
-        cycles = np.stack([FREQUENCY[0] * times + 0.5 * self.sweep * later**2, FREQUENCY[1] * times], -1)
+        cycles = FREQUENCY * times[..., None] + 0.5 * self.sweep * changing_time(times) ** 2
         return np.asarray(self.amplitude(times) * np.sin(2 * np.pi * cycles + PHASE))
 
 

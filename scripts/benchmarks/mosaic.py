@@ -5,25 +5,26 @@ frames.
 """
 
 import argparse
-import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
-from benchmarks.finer import EXPOSURE_ROWS, FADE, MARGIN, ROW_TIME, SEED, SHAKE, decibel
+from benchmarks.finer import EXPOSURE_ROWS, FADE, MARGIN, ROW_TIME, SEED, SHAKE
 from benchmarks.independent_camera import (
     POINTS_PER_PX,
     Array,
     after_optics,
     closed,
+    decibel,
     mosaic_of,
     still_image,
     take_frames,
 )
-from harness import Rows, one_thread, table
+from harness import Rows, table
 from skimage import data
 
 import rsvib_torch as rsv
@@ -65,18 +66,14 @@ def opencv(raw: Array) -> Array:
 def peers() -> dict[str, Demosaicing]:
     """Demosaicing of raw frames (T, H, W) with the pattern RGGB, by the name of the software that is installed."""
     found: dict[str, Demosaicing] = {"OpenCV": opencv}
-    try:
+    with suppress(ImportError):
         from colour_demosaicing import demosaicing_CFA_Bayer_Menon2007 as menon  # noqa: PLC0415
 
         found["Menon"] = lambda raw: np.stack([np.moveaxis(menon(frame, PATTERN), -1, 0) for frame in raw])
-    except ImportError:
-        pass
-    try:
+    with suppress(ImportError):
         from demosaicnet import BayerDemosaick  # noqa: PLC0415
 
         found["demosaicnet"] = partial(network, BayerDemosaick().eval())
-    except ImportError:
-        pass
     return found
 
 
@@ -115,23 +112,20 @@ def cases(name: str, side: int) -> Rows:
         for count in FRAMES:
             options: dict[str, Any] = {"joint": True, "check": False}
             row: dict[str, Any] = {"scene": name, "noise": noise, "frames": count, "peers": {}, "peers_half": {}}
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", rsv.RestorationWarning)
-                for peer, frames in coloured.items():
-                    image = rsv.restore(frames[:count], timing, detection, **options)[0]
-                    row["peers"][peer] = decibel(image, pixels, RIM)
-                    image = rsv.restore(frames[:count], timing, detection, scale=2, **options)[0]
-                    row["peers_half"][peer] = decibel(image, half, 2 * RIM)
-                frames = torch.from_numpy(raw[:count]).float()
-                image = rsv.restore(frames, timing, detection, scale=2, mosaic=PATTERN, **options)[0].numpy()
+            for peer, frames in coloured.items():
+                image = rsv.restore(frames[:count], timing, detection, **options)[0]
+                row["peers"][peer] = decibel(image, pixels, RIM)
+                image = rsv.restore(frames[:count], timing, detection, scale=2, **options)[0]
+                row["peers_half"][peer] = decibel(image, half, 2 * RIM)
+            frames = torch.from_numpy(raw[:count]).float()
+            image = rsv.restore(frames, timing, detection, scale=2, mosaic=PATTERN, **options)[0].numpy()
             row["mosaic"], row["mosaic_half"] = decibel(image[:, ::2, ::2], pixels, RIM), decibel(image, half, 2 * RIM)
             found.append(row)
     return found
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    with one_thread():
-        return [row for name in options.mosaic_scenes for row in cases(name, options.mosaic_size)]
+    return [row for name in options.mosaic_scenes for row in cases(name, options.mosaic_size)]
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:

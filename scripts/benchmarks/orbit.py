@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from benchmarks.independent_camera import POINTS_PER_PX, Array, Shake, after_optics, closed, take_frames
-from harness import Rows, one_thread, table
+from harness import Rows, table
 
 import rsvib_torch as rsv
 from rsvib_torch.datasets import city_and_fields
@@ -66,8 +66,7 @@ def case(name: str, size: tuple[int, int]) -> dict[str, Any]:
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    with one_thread():
-        return [case(name, tuple(options.orbit_size)) for name in CASES]
+    return [case(name, tuple(options.orbit_size)) for name in CASES]
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:

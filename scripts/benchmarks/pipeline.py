@@ -9,7 +9,6 @@ from a camera made without the package.
 
 import argparse
 import math
-import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
@@ -18,18 +17,13 @@ import numpy as np
 import torch
 from benchmarks import library_chain as libraries
 from benchmarks.independent_camera import Shake, closed, take_frames
-from benchmarks.resolution_chart import resolution_chart
+from benchmarks.resolution_chart import SCENES
 from harness import Rows, in_turns, table, table_of
 from numpy.typing import NDArray
 from torch import Tensor
 
 import rsvib_torch as rsv
-from rsvib_torch.datasets import city_and_fields
 
-SCENES: dict[str, Callable[[int, int, int], Tensor]] = {
-    "city": city_and_fields,
-    "chart": lambda height, width, seed: resolution_chart(height, width, seed=seed),
-}
 OPTIONS = {
     "pipeline_rows": (2048, "pipeline: rows of the frames where chains are compared"),
     "grid_size": (512, "pipeline: columns of these frames"),
@@ -44,9 +38,7 @@ AMPLITUDE, FREQUENCY = (3.1, 5.2), (50.0, 30.0)
 FULL_ROWS = 2048  # of the paper's camera
 TIMED_BALANCE, TIMED_NOISE = 0.01, 0.005
 PAPER, FASTEST = "matchTemplate, curve_fit, wiener rows (the paper's)", "matchTemplate, curve_fit, remap (fastest)"
-OURS, DEWARP = "detect_vibration, restore", 'detect_vibration, "dewarp"'
-NARROW = "detect_vibration on a quarter of the columns, restore"
-NARROW_DEWARP = 'detect_vibration on a quarter of the columns, "dewarp"'
+OURS = "detect_vibration, restore"
 DETECTIONS: dict[str, dict[str, Any]] = {  # options of detect_vibration; columns is the share of the columns
     "direct": {},
     "narrow": {"columns": 0.25},
@@ -56,9 +48,9 @@ DETECTIONS: dict[str, dict[str, Any]] = {  # options of detect_vibration; column
 }
 CHAINS = {  # of the package: detection and method of restoration
     OURS: ("direct", "exact"),
-    NARROW: ("narrow", "exact"),
-    DEWARP: ("direct", "dewarp"),
-    NARROW_DEWARP: ("narrow", "dewarp"),
+    "detect_vibration on a quarter of the columns, restore": ("narrow", "exact"),
+    'detect_vibration, "dewarp"': ("direct", "dewarp"),
+    'detect_vibration on a quarter of the columns, "dewarp"': ("narrow", "dewarp"),
     '"bands" by "ncc", "dewarp"': ("ncc", "dewarp"),
     '"bands" by "projection", "dewarp"': ("projection", "dewarp"),
     '"bands" on a quarter of the columns, "dewarp"': ("narrow bands", "dewarp"),
@@ -119,9 +111,7 @@ def errors_of(found: rsv.Vibration) -> dict[str, float]:
 
 def restored_by(frames: Tensor, timing: rsv.SensorTiming, found: rsv.Vibration, method: str) -> Tensor:
     """Both frames restored by the package."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", rsv.RestorationWarning)
-        return rsv.restore(frames, timing, found, method=method)
+    return rsv.restore(frames, timing, found, method=method)
 
 
 def quality(restored: Tensor, still: Tensor) -> float:

@@ -18,7 +18,7 @@ from benchmarks import independent_camera
 from benchmarks.independent_camera import Array, Shake, closed
 from benchmarks.pipeline import camera
 from benchmarks.resolution_chart import resolution_chart
-from harness import Rows, one_thread, table
+from harness import Rows, table
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import rsvib_torch as rsv
@@ -62,7 +62,6 @@ AXES = {"x": "horizontal", "y": "vertical"}
 TARGETS = {"chart": "ISO 12233", "landscape": "in-orbit simulation"}
 ROW_TIME, EXPOSURE_ROWS, FRAME_ROWS = 20.52e-6, 20, 2048
 AMPLITUDE, FREQUENCY = {"x": 3.1, "y": 5.2}, {"x": 50.0, "y": 30.0}  # px, Hz
-PERIOD = {"x": 20.0, "y": 33.33}  # ms, as printed in Table 1
 DETECTED = {
     "chart": {"x": Detected(20.048, 3.147, 0.653, 0.242, 1.526), "y": Detected(33.280, 5.195, 1.234, 0.161, 0.096)},
     "landscape": {"x": Detected(19.890, 3.084, 0.638, 0.551, 0.519), "y": Detected(33.122, 5.211, 1.227, 0.635, 0.218)},
@@ -141,11 +140,6 @@ def draw(target: str, size: Sequence[int], image_motion: float = 0.0) -> Scene:
     samples = closed(drawn.double().numpy(), (BORDER - 8) * PITCH)
     still = samples[down : height - down : PITCH, across : width - across : PITCH]
     return Scene(samples, still)
-
-
-def taken(scene: Scene, shake: Shake, timing: Any, count: int = 2) -> Array:
-    """Frames without noise."""
-    return independent_camera.take_frames(scene.samples, shake, timing, count, scene.still.shape, points=PITCH)
 
 
 def counts_of(frames: Array, noise: float, seed: int) -> Array:
@@ -261,7 +255,7 @@ def trials(
     """Detection and restoration of two frames by all methods for all noises; without edges (None) detection only."""
     shake = shake_of(case["seed"], case["speed"] * (-1) ** case["seed"])
     timing, results = camera(EXPOSURE_ROWS, len(scene.still)), []
-    clean = taken(scene, shake, timing)
+    clean = independent_camera.take_frames(scene.samples, shake, timing, 2, scene.still.shape, points=PITCH)
     for noise in noises:
         array, of_noise = counts_of(clean, noise, case["seed"]), case | {"noise": noise}
         frames = torch.from_numpy(array).float()
@@ -287,22 +281,21 @@ def trials(
 
 def rows(options: argparse.Namespace) -> Rows:
     results: Rows = []
-    with one_thread():
-        for target in TARGETS:
-            scene = draw(target, options.trial_size)
-            measured = options.trial_edges if target == "chart" else 0
-            edges = edges_of(scene.still.shape, measured) if measured else []
-            case: dict[str, Any] = {"target": target, "speed": 0.0}
-            for noise in options.trial_noises:
-                still = quality(counts_of(scene.still[None], noise, 0), scene.still, edges)
-                results += [{"part": "restoration", **case, "noise": noise, "seed": 0, "method": STILL, **still[0]}]
-            for seed in range(options.trials):
-                results += trials(scene, case | {"seed": seed}, options.trial_noises, edges)
-        for speed in options.trial_speeds:
-            scene = draw("landscape", options.trial_size, speed)
-            case = {"target": "landscape", "speed": speed}
-            for seed in range(options.trials):
-                results += trials(scene, case | {"seed": seed}, options.trial_noises[:1], None)
+    for target in TARGETS:
+        scene = draw(target, options.trial_size)
+        measured = options.trial_edges if target == "chart" else 0
+        edges = edges_of(scene.still.shape, measured) if measured else []
+        case: dict[str, Any] = {"target": target, "speed": 0.0}
+        for noise in options.trial_noises:
+            still = quality(counts_of(scene.still[None], noise, 0), scene.still, edges)
+            results += [{"part": "restoration", **case, "noise": noise, "seed": 0, "method": STILL, **still[0]}]
+        for seed in range(options.trials):
+            results += trials(scene, case | {"seed": seed}, options.trial_noises, edges)
+    for speed in options.trial_speeds:
+        scene = draw("landscape", options.trial_size, speed)
+        case = {"target": "landscape", "speed": speed}
+        for seed in range(options.trials):
+            results += trials(scene, case | {"seed": seed}, options.trial_noises[:1], None)
     return results
 
 

@@ -1,4 +1,4 @@
-"""A resolution chart similar to that of ISO 12233: a scene of tests and benchmarks."""
+"""A resolution chart similar to that of ISO 12233, and the scenes of tests and benchmarks."""
 
 import math
 from collections.abc import Callable
@@ -9,7 +9,7 @@ from pydantic import Field
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import checks_arguments
-from rsvib_torch.datasets import drawing
+from rsvib_torch.datasets import city_and_fields, drawing
 from rsvib_torch.datasets.drawing import FLOAT, Blur, Size, edge, rectangle, rotated
 
 _INK, _PAPER = 0.07, 0.86  # of full scale; a printed chart: grain and texture of either stay within 0 ... 1
@@ -40,42 +40,32 @@ def sectors(x: Tensor, y: Tensor, count: int, sigma: float) -> Tensor:
     return bars(cycles, frequency, 6, sigma).clamp(0.0, 1.0)
 
 
-class Canvas:
-    """An image to paint on, one shape after another, each within its own window."""
+def paint(
+    image: Tensor,
+    sigma: float,
+    centre: _Centre,
+    reach: float | tuple[float, float],
+    tone: float,
+    coverage: Callable[[Tensor, Tensor], Tensor],
+) -> None:
+    """Paint a tone over an image.
 
-    def __init__(self, image: Tensor, sigma: float) -> None:
-        self.image = image
-        self.sigma = sigma
-
-    def transposed(self) -> "Canvas":
-        """The same image with x and y exchanged."""
-        return Canvas(self.image.T, self.sigma)
-
-    def paint(
-        self,
-        centre: tuple[float, float],
-        reach: float | tuple[float, float],
-        tone: float,
-        coverage: Callable[[Tensor, Tensor], Tensor],
-    ) -> None:
-        """Paint a tone over the image.
-
-        The window has the half size ``reach`` (x, y) in px around the centre (column, row). ``coverage`` is a function
-        of the coordinates x (1, w) and y (h, 1) in px from the centre.
-        """
-        halves = reach if isinstance(reach, tuple) else (reach, reach)
-        places = []
-        for middle, half, size in zip(centre, halves, reversed(self.image.shape), strict=True):
-            pad = half + 5 * self.sigma
-            places.append(slice(max(math.floor(middle - pad), 0), min(math.ceil(middle + pad) + 1, size)))
-        window = self.image[places[1], places[0]]
-        columns, rows = (torch.arange(place.start, place.stop, device="cpu") for place in places)
-        window += coverage(columns[None] - centre[0], rows[:, None] - centre[1]) * (tone - window)
+    The window has the half size ``reach`` (x, y) in px around the centre (column, row), and a margin for the blur.
+    ``coverage`` is a function of the coordinates x (1, w) and y (h, 1) in px from the centre.
+    """
+    halves = reach if isinstance(reach, tuple) else (reach, reach)
+    places = []
+    for middle, half, size in zip(centre, halves, reversed(image.shape), strict=True):
+        pad = half + 5 * sigma
+        places.append(slice(max(math.floor(middle - pad), 0), min(math.ceil(middle + pad) + 1, size)))
+    window = image[places[1], places[0]]
+    columns, rows = (torch.arange(place.start, place.stop, device="cpu") for place in places)
+    window += coverage(columns[None] - centre[0], rows[:, None] - centre[1]) * (tone - window)
 
 
 @checks_arguments
 def resolution_chart(
-    height: Size, width: Size, *, sigma: Blur = 0.6, seed: int = 0, field: Annotated[float, Field(ge=32)] = 230.0
+    height: Size, width: Size, seed: int = 0, *, sigma: Blur = 0.6, field: Annotated[float, Field(ge=32)] = 230.0
 ) -> Tensor:
     """Draw a resolution chart: slanted edges, hyperbolic wedges, bar groups, stars, rings and grey fields.
 
@@ -94,7 +84,7 @@ def resolution_chart(
     generator = torch.Generator(device="cpu").manual_seed(seed)
     grain = drawing.fractal_texture(height, width, generator, exponent=0.5, longest=64.0, sigma=sigma)
     texture = drawing.fractal_texture(height, width, generator, exponent=1.2, longest=40.0, sigma=sigma)
-    canvas = Canvas(torch.full((height, width), _PAPER, **FLOAT), sigma)
+    canvas = torch.full((height, width), _PAPER, **FLOAT)
 
     rim = max(10.0, 0.014 * min(height, width))
     rows, columns = (max(3, 2 * round((size - 4 * rim) / (2 * field) - 0.5) + 1) for size in (height, width))
@@ -106,54 +96,55 @@ def resolution_chart(
         for j in range(columns):
             down, right = i - rows // 2, j - columns // 2
             centre = (2 * rim + (j + 0.5) * pitch[0] - 0.5, 2 * rim + (i + 0.5) * pitch[1] - 0.5)
-            _draw_field(canvas, relief, centre, size, (down, right))
+            _draw_field(canvas, relief, sigma, centre, size, (down, right))
     middle = (0.5 * (width - 1), 0.5 * (height - 1))
     for board, centre, step, count in (
         (canvas, middle, pitch[0], columns),
-        (canvas.transposed(), middle[::-1], pitch[1], rows),
+        (canvas.T, middle[::-1], pitch[1], rows),
     ):
         for side in (-1, 1):
-            _draw_wedge(board, centre, side, begin=0.55 * step, length=(min(2, count // 2) - 0.1) * step)
-    _draw_border(canvas, rim)
+            _draw_wedge(board, sigma, centre, side, begin=0.55 * step, length=(min(2, count // 2) - 0.1) * step)
+    _draw_border(canvas, sigma, rim)
     # grain and texture are proportional to the tone
-    return (canvas.image * (1.0 + relief[0] * grain + relief[1] * texture)).clamp(0.0, 1.0)
+    return (canvas * (1.0 + relief[0] * grain + relief[1] * texture)).clamp(0.0, 1.0)
 
 
-def _draw_field(canvas: Canvas, relief: Tensor, centre: _Centre, size: float, steps: tuple[int, int]) -> None:
+def _draw_field(
+    canvas: Tensor, relief: Tensor, sigma: float, centre: _Centre, size: float, steps: tuple[int, int]
+) -> None:
     """Draw the field at a position (down, right) from the middle one."""
     down, right = steps
     ring = max(abs(down), abs(right))
     if ring == 0:
-        _draw_star(canvas, centre, 0.42 * size, 72)
+        _draw_star(canvas, sigma, centre, 0.42 * size, 72)
         return
     if 0 in (down, right) and ring <= 2:
         return  # the wedges
     if abs(down) == abs(right):
         dark = (ring + (down > 0) + (right > 0)) % 2 == 0
         turn = math.copysign(math.radians(5.0), down * right)
-        _draw_slanted_square(canvas, relief, centre, size, dark=dark, turn=turn)
+        _draw_slanted_square(canvas, relief, sigma, centre, size, dark=dark, turn=turn)
         return
     kind = (3 * abs(down) + 2 * abs(right) + (down > 0) + 2 * (right > 0)) % len(_FIELDS)
-    _FIELDS[kind](canvas, relief, centre, size, ring)
+    _FIELDS[kind](canvas, relief, sigma, centre, size, ring)
 
 
-def _draw_star(canvas: Canvas, centre: _Centre, radius: float, count: int) -> None:
-    sigma = canvas.sigma
+def _draw_star(canvas: Tensor, sigma: float, centre: _Centre, radius: float, count: int) -> None:
     count = max(8, min(count, int(radius)))
-    canvas.paint(centre, radius, _INK, lambda x, y: sectors(x, y, count, sigma) * disc(x, y, radius, sigma))
-    canvas.paint(centre, radius, _INK, lambda x, y: disc(x, y, count / math.pi + 1.0, sigma))
+    paint(canvas, sigma, centre, radius, _INK, lambda x, y: sectors(x, y, count, sigma) * disc(x, y, radius, sigma))
+    paint(canvas, sigma, centre, radius, _INK, lambda x, y: disc(x, y, count / math.pi + 1.0, sigma))
     width = 0.02 * radius + 0.8
     for outline in (1.0, 1.1):
 
         def ring(x: Tensor, y: Tensor, r: float = outline * radius) -> Tensor:
             return disc(x, y, r + width, sigma) - disc(x, y, r, sigma)
 
-        canvas.paint(centre, outline * radius + width, _INK, ring)
+        paint(canvas, sigma, centre, outline * radius + width, _INK, ring)
 
 
-def _draw_wedge(canvas: Canvas, middle: _Centre, side: int, *, begin: float, length: float) -> None:
+def _draw_wedge(canvas: Tensor, sigma: float, middle: _Centre, side: int, *, begin: float, length: float) -> None:
     """Draw seven bars along x whose frequency rises towards the middle of the chart."""
-    sigma, count = canvas.sigma, 7
+    count = 7
     coarse, fine = max(0.025, 2.0 * count / length), 0.5
 
     def coverage(x: Tensor, y: Tensor) -> Tensor:
@@ -161,7 +152,7 @@ def _draw_wedge(canvas: Canvas, middle: _Centre, side: int, *, begin: float, len
         return bars(y * frequency + 0.5 * (count - 0.5), frequency, count, sigma) * _between(x, 0.5 * length, sigma)
 
     centre = (middle[0] + side * (begin + 0.5 * length), middle[1])
-    canvas.paint(centre, (0.5 * length, 0.5 * count / coarse), _INK, coverage)
+    paint(canvas, sigma, centre, (0.5 * length, 0.5 * count / coarse), _INK, coverage)
 
 
 def _between(x: Tensor, half: float, sigma: float) -> Tensor:
@@ -170,39 +161,39 @@ def _between(x: Tensor, half: float, sigma: float) -> Tensor:
 
 
 def _draw_slanted_square(
-    canvas: Canvas, relief: Tensor, centre: _Centre, size: float, *, dark: bool, turn: float
+    canvas: Tensor, relief: Tensor, sigma: float, centre: _Centre, size: float, *, dark: bool, turn: float
 ) -> None:
-    sigma, half = canvas.sigma, 0.3 * size
+    half = 0.3 * size
     ground, tone = (0.62, 0.12) if dark else (0.2, 0.74)
 
     def frame(x: Tensor, y: Tensor) -> Tensor:
         return rectangle(x, y, 0.46 * size, 0.46 * size, sigma)
 
-    canvas.paint(centre, 0.46 * size, ground, frame)
+    paint(canvas, sigma, centre, 0.46 * size, ground, frame)
     for layer in relief:  # no grain, for measurements of the edges
-        Canvas(layer, sigma).paint(centre, 0.46 * size, 0.0, frame)
-    canvas.paint(centre, 1.2 * half, tone, lambda x, y: rectangle(*rotated(x, y, turn), half, half, sigma))
+        paint(layer, sigma, centre, 0.46 * size, 0.0, frame)
+    paint(canvas, sigma, centre, 1.2 * half, tone, lambda x, y: rectangle(*rotated(x, y, turn), half, half, sigma))
 
 
-def _draw_bar_groups(canvas: Canvas, relief: Tensor, centre: _Centre, size: float, ring: int) -> None:
+def _draw_bar_groups(canvas: Tensor, relief: Tensor, sigma: float, centre: _Centre, size: float, ring: int) -> None:
     """Groups of five bars, vertical and horizontal, of four frequencies."""
-    sigma, count, length = canvas.sigma, 5, 0.085 * size
+    count, length = 5, 0.085 * size
     for place, share in enumerate((1.0, 0.7, 0.48, 0.32)):
         reach, down = 0.18 * size * share, centre[1] + (0.345 - 0.23 * place) * size
         for board, middle, half in (
             (canvas, (centre[0] - 0.23 * size, down), reach),
-            (canvas.transposed(), (down, centre[0] + 0.23 * size), length * share),
+            (canvas.T, (down, centre[0] + 0.23 * size), length * share),
         ):
 
             def coverage(x: Tensor, y: Tensor, f: float = 0.5 * (count - 0.5) / half) -> Tensor:
                 return bars(x * f + 0.5 * (count - 0.5), f, count, sigma) * _between(y, length, sigma)
 
-            board.paint(middle, (reach, length), _INK, coverage)
+            paint(board, sigma, middle, (reach, length), _INK, coverage)
 
 
-def _draw_rings(canvas: Canvas, relief: Tensor, centre: _Centre, size: float, ring: int) -> None:
+def _draw_rings(canvas: Tensor, relief: Tensor, sigma: float, centre: _Centre, size: float, ring: int) -> None:
     """Rings that grow narrower outwards."""
-    sigma, radius = canvas.sigma, 0.44 * size
+    radius = 0.44 * size
     finest = 0.22 if ring % 2 else 0.12
 
     def coverage(x: Tensor, y: Tensor) -> Tensor:
@@ -211,12 +202,12 @@ def _draw_rings(canvas: Canvas, relief: Tensor, centre: _Centre, size: float, ri
         cycles = 0.25 + 0.5 * finest * r.square() / radius  # a bar is centred on the rings
         return bars(torch.remainder(cycles, 1.0) + 2.0, frequency, 6, sigma) * edge(radius - r, sigma)
 
-    canvas.paint(centre, radius, _INK, coverage)
+    paint(canvas, sigma, centre, radius, _INK, coverage)
 
 
-def _draw_grey_steps(canvas: Canvas, relief: Tensor, centre: _Centre, size: float, ring: int) -> None:
+def _draw_grey_steps(canvas: Tensor, relief: Tensor, sigma: float, centre: _Centre, size: float, ring: int) -> None:
     """Three by three textured patches of different tone."""
-    sigma, half = canvas.sigma, 0.145 * size
+    half = 0.145 * size
     for i in range(3):
         for j in range(3):
             tone = 0.12 + 0.07 * ((4 * i + 2 * j + 5 * ring) % 9)
@@ -225,13 +216,12 @@ def _draw_grey_steps(canvas: Canvas, relief: Tensor, centre: _Centre, size: floa
             def patch(x: Tensor, y: Tensor) -> Tensor:
                 return rectangle(x, y, half, half, sigma)
 
-            canvas.paint(middle, half, tone, patch)
-            Canvas(relief[1], sigma).paint(middle, half, 0.1, patch)
+            paint(canvas, sigma, middle, half, tone, patch)
+            paint(relief[1], sigma, middle, half, 0.1, patch)
 
 
-def _draw_needles(canvas: Canvas, relief: Tensor, centre: _Centre, size: float, ring: int) -> None:
+def _draw_needles(canvas: Tensor, relief: Tensor, sigma: float, centre: _Centre, size: float, ring: int) -> None:
     """A fan of slanted lines of different width, and a disc."""
-    sigma = canvas.sigma
     for index in range(8):
         angle = math.pi * (index + 0.25) / 8
         width = 0.7 + 0.006 * size * (index % 4)
@@ -239,32 +229,37 @@ def _draw_needles(canvas: Canvas, relief: Tensor, centre: _Centre, size: float, 
         def needle(x: Tensor, y: Tensor, angle: float = angle, width: float = width) -> Tensor:
             return rectangle(*rotated(x, y, angle), 0.45 * size, width, sigma)
 
-        canvas.paint(centre, 0.45 * size, _INK, needle)
-    canvas.paint(centre, 0.13 * size, _INK, lambda x, y: disc(x, y, 0.13 * size, sigma))
-    canvas.paint(centre, 0.1 * size, _PAPER, lambda x, y: disc(x, y, 0.1 * size, sigma))
+        paint(canvas, sigma, centre, 0.45 * size, _INK, needle)
+    paint(canvas, sigma, centre, 0.13 * size, _INK, lambda x, y: disc(x, y, 0.13 * size, sigma))
+    paint(canvas, sigma, centre, 0.1 * size, _PAPER, lambda x, y: disc(x, y, 0.1 * size, sigma))
 
 
-_FIELDS: tuple[Callable[[Canvas, Tensor, _Centre, float, int], None], ...] = (
+_FIELDS: tuple[Callable[[Tensor, Tensor, float, _Centre, float, int], None], ...] = (
     _draw_bar_groups,
     _draw_grey_steps,
     _draw_rings,
     _draw_bar_groups,
     _draw_needles,
-    lambda canvas, relief, centre, size, ring: _draw_star(canvas, centre, 0.36 * size, 36 if ring % 2 else 24),
+    lambda canvas, relief, sigma, centre, size, ring: _draw_star(
+        canvas, sigma, centre, 0.36 * size, 36 if ring % 2 else 24
+    ),
     _draw_grey_steps,
 )
 
 
-def _draw_border(canvas: Canvas, depth: float) -> None:
+def _draw_border(canvas: Tensor, sigma: float, depth: float) -> None:
     """Draw black teeth that point inwards along all four borders, wider towards one end."""
-    for board in (canvas, canvas.transposed()):
-        height, width = board.image.shape
+    for board in (canvas, canvas.T):
+        height, width = board.shape
         for row, inwards in ((0.0, 1), (height - 1.0, -1)):
 
             def coverage(x: Tensor, y: Tensor, inwards: int = inwards, width: int = width) -> Tensor:
                 place = (x / width + 0.5).clamp(0.0, 1.0)
                 cycles = (width / (2.4 * depth)) * (place - 0.15 * place * (1 - place))
                 tooth = depth * (1.0 - 2.0 * (torch.remainder(cycles, 1.0) - 0.5).abs())
-                return edge((tooth - inwards * y) / math.sqrt(2.0), canvas.sigma)
+                return edge((tooth - inwards * y) / math.sqrt(2.0), sigma)
 
-            board.paint((0.5 * (width - 1), row), (0.5 * width, depth), _INK, coverage)
+            paint(board, sigma, (0.5 * (width - 1), row), (0.5 * width, depth), _INK, coverage)
+
+
+SCENES: dict[str, Callable[[int, int, int], Tensor]] = {"city": city_and_fields, "chart": resolution_chart}

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from harness import Rows, one_thread, table_of
+from harness import Rows, table_of
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
@@ -86,8 +86,7 @@ def other_row(name: str, seeds: int) -> dict[str, Any]:
 
 def rows(options: argparse.Namespace) -> Rows:
     fewer = max(options.seeds // 5, 1)
-    with one_thread():
-        return [*(gaussian_row(sigma, options.seeds) for sigma in SIGMAS), *(other_row(name, fewer) for name in OPTICS)]
+    return [*(gaussian_row(sigma, options.seeds) for sigma in SIGMAS), *(other_row(name, fewer) for name in OPTICS)]
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:

@@ -13,10 +13,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from benchmarks.finer import decibel
-from benchmarks.independent_camera import Array, Shake, closed, take_frames
+from benchmarks.independent_camera import Array, Shake, closed, decibel, take_frames
 from benchmarks.resolution_chart import resolution_chart
-from harness import Rows, one_thread, table
+from harness import Rows, table
 
 import rsvib_torch as rsv
 from rsvib_torch.datasets import city_and_fields
@@ -89,8 +88,7 @@ def cases(draw: int) -> Rows:
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    with one_thread():
-        return [row for draw in range(options.verdict_draws) for row in cases(options.verdict_seed + draw)]
+    return [row for draw in range(options.verdict_draws) for row in cases(options.verdict_seed + draw)]
 
 
 def lines(results: Rows, options: argparse.Namespace, tie: float = 0.3) -> list[str]:

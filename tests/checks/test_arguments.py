@@ -4,15 +4,12 @@ import gc
 import math
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import TypeVar, get_origin
 
 import numpy as np
 import pytest
 import torch
-from typing_extensions import TypeAliasType
 
 import rsvib_torch as rsv
-from rsvib_torch.checks.values import members_of
 from rsvib_torch.datasets import city_and_fields
 from rsvib_torch.results.reason import Reason
 from rsvib_torch.video import Margins
@@ -357,11 +354,3 @@ def test_tensors_are_freed_without_garbage_collection():
         gc.set_debug(0)
         gc.garbage.clear()
         gc.enable()
-
-
-def test_arrays_of_numpy_with_a_type_alias_are_known():
-    """``NDArray`` is an alias from NumPy 2.5 on."""
-    parameter = TypeVar("parameter", bound=np.generic)
-    alias = TypeAliasType("alias", np.ndarray[tuple[int, ...], np.dtype[parameter]], type_params=(parameter,))
-    array, of_union = members_of(alias[np.float64] | int | None)
-    assert (get_origin(array), of_union) == (np.ndarray, int)

@@ -177,6 +177,8 @@ def test_options_describe_the_camera_without_a_file(place, tmp_path, capsys):
     stated = json.loads((found / "vibration.json").read_text())
     assert stated["timing"]["frame_rows"] == pytest.approx(512)
     assert [tones[0] for tones in stated["vibration"]["amplitude"]] == pytest.approx(AMPLITUDE, rel=0.02)
+    unexposed = refused(capsys, "detect", place / "frames.tif", *camera[:2], "--out", tmp_path / "none")
+    assert "the camera is not described: give --exposure, or --config" in unexposed
     np.save(tmp_path / "frames.npy", np.zeros((2, 96, 96), np.uint8))
     assert "the camera is not described: give --frame-rate, or --config" in refused(
         capsys, "detect", tmp_path / "frames.npy", *camera, "--out", tmp_path / "none"
