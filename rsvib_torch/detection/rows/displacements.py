@@ -23,7 +23,7 @@ from rsvib_torch.execution.parallel import chunks, runs
 from rsvib_torch.motion.motion import ColumnStrips, Motion
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.numerics.interpolation import extend_rows, fast_length
-from rsvib_torch.numerics.tables import Array, table, tables
+from rsvib_torch.numerics.tables import Array, table, tables, tensor
 from rsvib_torch.registration.gradients import BLOCK, RowGradients, residual_products, row_equations, row_gradients
 from rsvib_torch.registration.row_spectra import EVERY, RowSpectra, column_pattern, overlapping
 
@@ -294,15 +294,15 @@ def joined_groups(parts: list[MeasuredGroup], exposure_time: float, groups: int 
     return replace(measurements, displacements=measurements.relative(measurements.displacements))
 
 
-def column_pattern_of(
-    groups: list[FrameGroups], timing: RowTiming, motion: Motion, gradients: list[RowGradients]
-) -> Tensor | None:
-    """``column_pattern`` of every fourth row of all groups."""
+def column_pattern_of(groups: list[FrameGroups], timing: RowTiming, motion: Motion, row_variance: Array) -> Tensor:
+    """``column_pattern`` of every fourth row of all groups, whose rows have residual variances (B, M, S)."""
     parts = []
-    for group, of_group in zip(groups, gradients, strict=True):
+    ends = np.cumsum([group.count for group in groups])[:-1]
+    for group, of_group in zip(groups, np.split(row_variance[..., ::EVERY], ends, 1), strict=True):
         height, of_groups = group.spectra.height, group.motion_of_groups(motion)
         positions = Positions.of(group.starts_of_groups, height, timing, of_groups, EVERY)
-        visible, variance = positions.visible(height, BLOCK_ROWS // EVERY), of_group.variance[:, ::EVERY]
+        visible = positions.visible(height, BLOCK_ROWS // EVERY)
+        variance = tensor(of_group).flatten(0, 1).to(visible.device)
         spectra = group.spectra.in_groups(group.count)
         parts.append((spectra, positions.rows, positions.shift, visible, variance))
     return column_pattern(parts)
