@@ -72,10 +72,10 @@ def judged(
         quantities |= measured | {"within_row_time": table(within)}
 
     # 2. The comparisons with the limits.
-    findings, least_gain = [], _MIN_GAIN_OF_TWO if intervals.size == 1 else MIN_GAIN
+    findings, two_frames = [], intervals.size == 1
     for numbers in zip(*(values.tolist() for values in quantities.values()), strict=True):
         stack = dict(zip(quantities, numbers, strict=True))
-        against = _reasons_against_stack(stack, timing, max_tones, least_gain)
+        against = _reasons_against_stack(stack, timing, max_tones, two_frames)
         # A displacement by roll or zoom depends on the distance from the centre.
         for reasons in against[2:]:
             reasons[:] = [
@@ -107,8 +107,9 @@ def compared_bands(offsets: Array, fitted: Array, visible: Array) -> dict[str, A
     }
 
 
-def _reasons_against_stack(stack: Table, timing: RowTiming, max_tones: float, least_gain: float) -> list[list[Reason]]:
+def _reasons_against_stack(stack: Table, timing: RowTiming, max_tones: float, two_frames: bool) -> list[list[Reason]]:
     """Reasons against each axis of one stack, from the numbers of its compared quantities."""
+    least_gain = _MIN_GAIN_OF_TWO if two_frames else MIN_GAIN
     by_rows, axes, of_all = "bands" not in stack, len(stack["amplitude"]), []
     if stack["measured"] < _MIN_MEASURED:
         what = "the rows that frames have in common" if by_rows else f"{stack['bands']:g} row bands"
@@ -132,7 +133,7 @@ def _reasons_against_stack(stack: Table, timing: RowTiming, max_tones: float, le
             reasons += residual_reasons(name, numbers)
         else:
             reasons += _band_reasons(name, numbers)
-        if not reasons:
+        if not (reasons or two_frames):
             aliases += _alias_reasons(name, numbers, timing)
         against.append(reasons)
     return [[*aliases, *reasons] for reasons in against]
@@ -168,9 +169,9 @@ _LEAST_ALIAS_ERROR, _MOST_ALIAS_ERROR = 0.01, 0.15
 def _alias_reasons(axis: str, numbers: Table, timing: RowTiming) -> list[Reason]:
     """Reason against all axes from tones of an axis, reliable otherwise, that are a multiple of the frame rate apart.
 
-    With a wrong timing, two of them explain one tone, and the axes have one timing. Of 13 axes with several tones in
-    three frames or more that were reliable and wrong (frame_rows, row_time or the size of frames wrong, interlaced
-    rows, exposures that alternate), 10 had such tones; of 45 right ones, 1.
+    With a wrong timing, two of them explain one tone in three frames or more, and the axes have one timing. Of 13 axes
+    with several tones that were reliable and wrong (frame_rows, row_time or the size of frames wrong, interlaced rows,
+    exposures that alternate), 10 had such tones; of 45 right ones, 1.
     """
     tones = zip(*(numbers[name] for name in ("amplitude", "frequency", "frequency_std")), strict=True)
     for (size, hertz, std), (other_size, other_hertz, other_std) in combinations(tones, 2):
