@@ -2,7 +2,7 @@
 
 1. The motion is a translation: all columns of a row are displaced alike.
 2. If the halves of the rows move apart as roll and zoom cause it, or if roll and zoom are requested: a motion with
-   roll and zoom. All stacks of a batch then have these components.
+   roll and zoom. All stacks of a batch have these components then, if any stack rolls.
 3. If only the halves of the rows move apart: each half by itself. Halves at unequal distances move apart uniformly
    (parallax) and vibrate alike, which confirms the translation.
 4. If the rows agree with another timing: that timing (``other_timing``), which then is the reason against the axes. The
@@ -28,7 +28,7 @@ from rsvib_torch.detection.verdict import rotation_possible
 from rsvib_torch.frames.prepare import GreyFrames
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
-from rsvib_torch.numerics.tables import table
+from rsvib_torch.numerics.tables import table, take_stacks
 from rsvib_torch.registration.register import fits_frame
 
 
@@ -50,20 +50,21 @@ def detect_tones(
     least_axes, most_axes = axes
     refined = translation.fitted.refined
     requested = camera is not None or least_axes > 2
-    possible = False
+    possible = np.full(len(stacks.images), requested)
     if refined is not None and most_axes > 2 and strips_fit(height, width, options.bands):
-        possible = bool(rotation_possible(refined.other_motion, refined.uneven, height / width).any())
-    if requested or possible:
+        possible |= rotation_possible(refined.other_motion, refined.uneven, height / width)
+    if possible.any():
         hypothesis = Hypothesis(
             FieldScale(most_axes, width, height, camera),
             is_doubtful=not requested,
-            translation=translation.fit,
+            translation=take_stacks([translation.fit], np.flatnonzero(possible)),
         )
-        rotation = attempt(stacks, row_timing, options, hypothesis)
-        if requested or not rotation.abandoned.all():  # parallax otherwise
-            moving = _moving_axes(rotation, least_axes)
-            if requested or moving > 2:
-                return _assembled(rotation, timing, num_frames).with_axes(moving)
+        rotation = attempt(stacks.some(possible), row_timing, options, hypothesis)
+        moving = _moving_axes(rotation, least_axes)
+        if requested or (moving > 2 and not rotation.abandoned.all()):  # parallax otherwise
+            if not possible.all():
+                rotation = attempt(stacks, row_timing, options, replace(hypothesis, translation=translation.fit))
+            return _assembled(rotation, timing, num_frames).with_axes(moving)
 
     # 3. The same vibration of both halves.
     translation = _without_parallax(stacks, row_timing, options, translation)

@@ -5,10 +5,11 @@
 1. warp the frames to the scene by the current motion, and measure the residual displacement and the information matrix
    of every scene row (``rows.displacements``), with roll and zoom in strips of columns (``rows.grouped_frames``),
 2. fit tones and image motion to the measurements by weighted least squares (``tones``),
-3. decide: stop, subtract a pattern of columns and begin again, or continue, possibly with a faster step.
+3. decide: stop, or continue, possibly with a faster step.
 
 Step 1 does not depend on the model of the motion, step 2 does not depend on images. All B stacks take part in a round;
-those that are finished leave the batch.
+those that are finished leave the batch. Patterns of columns that are found around the final motion are subtracted, and
+the rounds repeated.
 
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
@@ -18,7 +19,6 @@ from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
-from torch import Tensor
 
 from rsvib_torch.detection.convergence import Acceleration, Step, is_converged
 from rsvib_torch.detection.measurements import Measurements, OtherMotion
@@ -62,6 +62,7 @@ class FittedRows:
     aliasing: Array  # (B,) px, expected size of the bias of the displacements by aliasing
     uneven: Array  # (B, 2) px, differences of the displacements along a row that roll and zoom cannot explain
     frames: GroupedFrames  # the frames; without a pattern of columns if there was one
+    row_variance: Array  # (B, M, S) residual variance of the S rows of the M groups of frames
     unknown: Array  # (B, A P, A P) covariance of what the last rounds changed; 0 for stacks that converged
     abandoned: Array  # (B,) bool, stacks whose large residual ended the rounds early
 
@@ -75,11 +76,26 @@ def refine(
     may_abandon: bool = False,
 ) -> FittedRows:
     """Refine a motion of row bands on the images: the last measurements and the fit; arguments as in ``Refinement``."""
-    # Rounds of measuring and fitting from the given start.
-    refined = _rounds(frames, intervals, start, tones, may_abandon)
-    # A long exposure can make the start choose the wrong side of a blind frequency: the other side is tried as well,
-    # one axis after the other.
+    # 1. Rounds of measuring and fitting from the given start.
+    refined = _rounds(frames, intervals, start, tones, may_abandon=may_abandon)
+    # 2. Stacks with a pattern of columns are fitted again without it. A strong pattern biases its first estimate, and
+    # is therefore subtracted twice.
     device = frames.groups[0].starts.device
+    for _ in range(2):
+        motion = motion_of_fit(shrunk(refined.fit, intervals), device)
+        pattern = refined.frames.column_pattern(motion, refined.row_variance)
+        found = table((pattern != 0).any(-1)).reshape(len(refined.abandoned), -1).any(1) & ~refined.abandoned
+        if not found.any():
+            break
+        index = np.flatnonzero(found)
+        cleaned = refined.frames.without(pattern)
+        from_fit = take_stacks([refined.fit], index)
+        again = _rounds(cleaned.stacks(index), intervals, from_fit, tones, search_round=0)
+        place = np.arange(len(found))
+        place[index] = len(found) + np.arange(len(index))
+        refined = replace(_taken([refined, again], place), frames=cleaned)
+    # 3. A long exposure can make the start choose the wrong side of a blind frequency: the other side is tried as well,
+    # one axis after the other.
     blurred = frames.differently_blurred(motion_of_fit(shrunk(start, intervals), device))
     tried = ~(blurred[:, None] | _is_nearly_blind(refined.fit, intervals))  # other axes count as tried
     while not tried.all():
@@ -90,14 +106,14 @@ def refine(
         active, index = strongest_only(refined.fit).active, np.flatnonzero(mirrored.any(-1))
         other, _ = robust_fit(refined.measurements, frequencies, active, start.drift_order)
         # a pattern that was subtracted does not appear again
-        again = _rounds(refined.frames.stacks(index), intervals, take_stacks([other], index), tones, False)
+        again = _rounds(refined.frames.stacks(index), intervals, take_stacks([other], index), tones)
         refined = with_better(refined, again, index)
-    # Tones that the exact fit does not confirm are left out.
+    # 4. Tones that the exact fit does not confirm are left out.
     if tones is None:
         fit = significant_only(refined.measurements, refined.fit, intervals)
         if fit is not refined.fit:  # it was fitted again, without what the last rounds changed
             refined = replace(refined, fit=replace(fit, covariance=fit.covariance + refined.unknown))
-    # The difference of the blur of the frames, by the final motion, contradicts a wrong exposure time.
+    # 5. The difference of the blur of the frames, by the final motion, contradicts a wrong exposure time.
     blur = table(refined.frames.blur_ratio(motion_of_fit(shrunk(refined.fit, intervals), device)))
     return replace(refined, other_motion=replace(refined.other_motion, blur=blur))
 
@@ -107,38 +123,25 @@ def _rounds(
     intervals: Array,
     start: ToneFit,
     tones: int | None,
-    may_abandon: bool,
+    *,
+    may_abandon: bool = False,
+    search_round: int = 1,
 ) -> FittedRows:
-    """All rounds from a start: parts of the batch that are finished leave it, or begin again by themselves."""
-    running = [Refinement(frames, intervals, start, tones, may_abandon=may_abandon)]
-    finished: list[Refinement] = []
-    while running:
-        refinement = running.pop()
-        refinement.step()
-        continued = ~(refinement.ended | refinement.settled)
-        if refinement.ended.any():
-            finished.append(refinement.only(refinement.ended))
-        if refinement.settled.any():
-            part = refinement.only(refinement.settled)
-            (running if part.begins_again() else finished).append(part)
-        if continued.any():
-            part = refinement.only(continued)
-            part.accelerate()
-            running.append(part)
-    return _joined(finished, frames)
-
-
-def _joined(finished: list["Refinement"], frames: GroupedFrames) -> FittedRows:
-    """The results of refinements of parts of a batch, whose frames are given, as one of all its stacks."""
-    results = [refinement.result() for refinement in finished]
-    # Frames without the patterns of columns that were subtracted.
-    for refinement in finished:
-        if refinement.pattern is not None:
-            frames = frames.without(refinement.pattern, refinement.stacks)
-    if len(results) == 1:
-        return replace(results[0], frames=frames)
-    order = np.concatenate([refinement.stacks for refinement in finished]).argsort()
-    return replace(_taken(results, order), frames=frames)
+    """All rounds from a start; arguments as in ``Refinement``."""
+    running = Refinement(frames, intervals, start, tones, may_abandon=may_abandon, search_round=search_round)
+    results: list[FittedRows] = []
+    stacks: list[Array] = []
+    while True:
+        running.step()
+        done = running.ended | running.settled
+        if done.any():
+            part = running.only(done)
+            results, stacks = [*results, part.result()], [*stacks, part.stacks]
+        if done.all():
+            break
+        running = running.only(~done)
+        running.accelerate()
+    return replace(_taken(results, np.concatenate(stacks).argsort()), frames=frames)
 
 
 def _taken(results: Sequence[FittedRows], index: Array) -> FittedRows:
@@ -156,7 +159,9 @@ class Refinement:
 
     ``intervals`` (M,) are the times in s between the frames that are compared; ``tones`` is the number of tones of each
     axis, None to select it by significance. ``may_abandon``: whether the motion is possibly of another kind than
-    assumed (parallax instead of roll); stacks with a large residual after three rounds are then abandoned.
+    assumed (parallax instead of roll); stacks with a large residual after three rounds are then abandoned. Further
+    tones are searched for in the round ``search_round``: the first round removes the error of the band offsets, and
+    weak tones are significant after it.
     """
 
     def __init__(
@@ -167,16 +172,15 @@ class Refinement:
         tones: int | None,
         *,
         may_abandon: bool = False,
+        search_round: int = 1,
     ) -> None:
-        self.frames, self.fit = frames, start  # without a pattern that was subtracted; the fit of the last round
+        self.frames, self.fit = frames, start  # the fit of the last round
         # the fits around whose motions the next round measures and the last one measured
         self.around = self.warped_by = shrunk(start, intervals)
-        # the next round, and the one in which further tones are searched for: the first round removes the error of the
-        # band offsets, and weak tones are significant after it
-        self.round, self.search_round = 0, 1
+        self.round, self.search_round = 0, search_round  # the next round
         self.stacks = np.arange(len(start.centre))  # (B,) indices in the batch
-        # (B,) bool: stacks that no further round is permitted for, or would help; others that need none, unless a
-        # pattern of columns is the cause; those whose next round would change little; those that are abandoned
+        # (B,) bool: stacks that no further round is permitted for, or would help; others that need none; those whose
+        # next round would change little; those that are abandoned
         self.ended = self.settled = self.converged = self.abandoned = np.zeros_like(start.centre, dtype=bool)
         self._intervals, self._tones, self._may_abandon = intervals, tones, may_abandon
         # exposures average out faster tones
@@ -187,10 +191,6 @@ class Refinement:
         self._acceleration = Acceleration()
         self._step: Step  # of the last round
         self._stalled: Array  # (B, A) bool, after the last round
-        self.pattern: Tensor | None = None  # (R, U) spectrum that was subtracted from the R rows of stacks or strips
-        # a strong pattern biases its first estimate, so that it is subtracted twice
-        self._patterns_left = 2
-        self._refused: Array | None = None  # (B, A) residuals before a pattern was subtracted, if all axes were refused
         # of the rounds since the search: (B, A) typical residuals in standard deviations, and fits of the same tones
         self._sizes: list[Array] = []
         self._fits: list[ToneFit] = []
@@ -223,14 +223,12 @@ class Refinement:
         self.warped_by, self.around = self.around, shrunk(fit, self._intervals)
         self._gradients = measured.gradients
 
-        # 3. Stacks that no further round would help: those whose rows are not measured, those whose hypothesis leaves a
-        # large residual, and those whose residual remains although a pattern of columns was subtracted because of it.
+        # 3. Stacks that no further round would help: those whose rows are not measured, and those whose hypothesis
+        # leaves a large residual.
         if self._may_abandon and self.round == _TRIED_ROUNDS:
             other = conclude(self.frames, measured, self.fit).other_motion
             self.abandoned = np.any(other.unexplained > _MAX_RESIDUAL * other.permitted, -1)
         self.ended = self.abandoned | ~(measurements.weights > 0).any((1, 2)) | (self.round == _MAX_ROUNDS)
-        if self._refused is not None and self.round == self.search_round + 2:
-            self.ended = self.ended | (size > 0.5 * self._refused).all(-1)
 
         # 4. Settled stacks: the next round would change the motion by much less than its standard deviation, or the
         # residual of an axis that is refused hardly decreases.
@@ -239,22 +237,6 @@ class Refinement:
         self._stalled = self._refused_for_good(measured)
         self.converged = np.all(converged, -1)
         self.settled = np.all(converged | self._stalled, -1) & ~self.ended
-
-    def begins_again(self) -> bool:
-        """Subtract a pattern of columns and begin again; False if there is none, or if all axes are refused again."""
-        refused = self._sizes[-1] if self._sizes and self._stalled.all() else None
-        if self._patterns_left == 0 or (refused is not None and self._refused is not None):
-            return False
-        assert self._gradients is not None
-        pattern = self.frames.column_pattern(self.motion, self._gradients)
-        if pattern is None:
-            return False
-        self.frames, self._gradients = self.frames.without(pattern), None
-        self.pattern = pattern if self.pattern is None else self.pattern + pattern
-        self._patterns_left, self._refused = self._patterns_left - 1, refused
-        self.converged, self.search_round = np.zeros_like(self.converged), self.round
-        self._sizes, self._acceleration = [], Acceleration()
-        return True
 
     def accelerate(self) -> None:
         """Accelerate the last step from the ones before; the gradients are kept where it is short."""
@@ -280,13 +262,10 @@ class Refinement:
         part._fits = [take_stacks([fit], index) for fit in self._fits]
         part._acceleration = Acceleration([take_stacks([step], index) for step in self._acceleration.steps])
         part._sizes = [size[index] for size in self._sizes]
-        for name in ("stacks", "ended", "settled", "converged", "abandoned", "_stalled", "_refused"):
-            values = getattr(self, name)
-            setattr(part, name, None if values is None else values[index])
+        for name in ("stacks", "ended", "settled", "converged", "abandoned", "_stalled"):
+            setattr(part, name, getattr(self, name)[index])
         if self._gradients is not None:
             part._gradients = part._measured.gradients
-        if self.pattern is not None:
-            part.pattern = self.pattern[self.frames.rows_of(index)]
         return part
 
     def result(self) -> FittedRows:
@@ -368,6 +347,7 @@ def conclude(frames: GroupedFrames, measured: MeasuredRows, fit: ToneFit) -> Fit
         aliasing=measured.aliasing(),
         uneven=measured.uneven(),
         frames=frames,
+        row_variance=measured.row_variance(),
         unknown=np.zeros_like(fit.covariance),
         abandoned=np.zeros_like(fit.centre, dtype=bool),
     )

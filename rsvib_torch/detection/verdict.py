@@ -72,10 +72,10 @@ def judged(
         quantities |= measured | {"within_row_time": table(within)}
 
     # 2. The comparisons with the limits.
-    findings, least_gain = [], _MIN_GAIN_OF_TWO if intervals.size == 1 else MIN_GAIN
+    findings, two_frames = [], intervals.size == 1
     for numbers in zip(*(values.tolist() for values in quantities.values()), strict=True):
         stack = dict(zip(quantities, numbers, strict=True))
-        against = _reasons_against_stack(stack, timing, max_tones, least_gain)
+        against = _reasons_against_stack(stack, timing, max_tones, two_frames)
         # A displacement by roll or zoom depends on the distance from the centre.
         for reasons in against[2:]:
             reasons[:] = [
@@ -107,8 +107,9 @@ def compared_bands(offsets: Array, fitted: Array, visible: Array) -> dict[str, A
     }
 
 
-def _reasons_against_stack(stack: Table, timing: RowTiming, max_tones: float, least_gain: float) -> list[list[Reason]]:
+def _reasons_against_stack(stack: Table, timing: RowTiming, max_tones: float, two_frames: bool) -> list[list[Reason]]:
     """Reasons against each axis of one stack, from the numbers of its compared quantities."""
+    least_gain = _MIN_GAIN_OF_TWO if two_frames else MIN_GAIN
     by_rows, axes, of_all = "bands" not in stack, len(stack["amplitude"]), []
     if stack["measured"] < _MIN_MEASURED:
         what = "the rows that frames have in common" if by_rows else f"{stack['bands']:g} row bands"
@@ -132,7 +133,7 @@ def _reasons_against_stack(stack: Table, timing: RowTiming, max_tones: float, le
             reasons += residual_reasons(name, numbers)
         else:
             reasons += _band_reasons(name, numbers)
-        if not reasons:
+        if not (reasons or two_frames):
             aliases += _alias_reasons(name, numbers, timing)
         against.append(reasons)
     return [[*aliases, *reasons] for reasons in against]
@@ -168,9 +169,9 @@ _LEAST_ALIAS_ERROR, _MOST_ALIAS_ERROR = 0.01, 0.15
 def _alias_reasons(axis: str, numbers: Table, timing: RowTiming) -> list[Reason]:
     """Reason against all axes from tones of an axis, reliable otherwise, that are a multiple of the frame rate apart.
 
-    With a wrong timing, two of them explain one tone, and the axes have one timing. Of 13 axes with several tones in
-    three frames or more that were reliable and wrong (frame_rows, row_time or the size of frames wrong, interlaced
-    rows, exposures that alternate), 10 had such tones; of 45 right ones, 1.
+    With a wrong timing, two of them explain one tone in three frames or more, and the axes have one timing. Of 13 axes
+    with several tones that were reliable and wrong (frame_rows, row_time or the size of frames wrong, interlaced rows,
+    exposures that alternate), 10 had such tones; of 45 right ones, 1.
     """
     tones = zip(*(numbers[name] for name in ("amplitude", "frequency", "frequency_std")), strict=True)
     for (size, hertz, std), (other_size, other_hertz, other_std) in combinations(tones, 2):
@@ -337,17 +338,18 @@ def exposure_reasons(timing: RowTiming, ratio: float, std: float, size: float | 
     """Reasons against all axes from the difference of the blur between frames.
 
     Its ratio to the expected one is the square of the ratio of the exposure times (docs/verdicts.md). A stated exposure
-    that is far too short expects nearly no blur, so that what counts is the size of the measured difference. Sizes
-    above 0.25 of the detail are beyond the second order, with which ratios of 0.5 to 1.5 were measured for sizes of
-    0.05 and more. Negative ratios are caused by another error, because no exposure time gives them. H.264 predicts
-    frames from others and lowers the ratio, from 1.06 to 0.94, 0.61 and 0.23 with CRF 10, 17 and 23: without a size,
-    frames are those of a video, and only a large ratio is a reason.
+    that is far too short expects nearly no blur, so that what counts is the size of the measured difference: without
+    any blur, slow tones and large ones had up to 0.012 of the detail. Sizes above 0.25 of the detail are beyond the
+    second order, with which ratios of 0.5 to 1.5 were measured for sizes of 0.05 and more. Negative ratios are caused
+    by another error, because no exposure time gives them. H.264 predicts frames from others and lowers the ratio, from
+    1.06 to 0.94, 0.61 and 0.23 with CRF 10, 17 and 23: without a size, frames are those of a video, and only a large
+    ratio is a reason.
     """
     low, high = 0.6, 2.0
     is_low, is_high = False, ratio > high and ratio - 1 > 4 * std
     if size is not None:
-        is_low = -0.3 < ratio < low and 1 - ratio > 3 * std and 0.002 < size < 0.25
-        is_high = is_high and (ratio - 1) * size > 0.002 and size < 0.25
+        is_low = -0.3 < ratio < low and 1 - ratio > 3 * std and size < 0.25
+        is_high = is_high and (ratio - 1) * size > 0.01 and size < 0.25
     if not (is_low or is_high):
         return []
     details: dict[str, float | str] = {"exposure_rows": timing.exposure_rows}

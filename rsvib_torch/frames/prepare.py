@@ -29,6 +29,7 @@ from rsvib_torch.frames.pixels import (
     mosaic_free,
 )
 from rsvib_torch.motion.timing import RowTiming, SensorTiming, check_timing, row_axes
+from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import MaskedInputOptions
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
@@ -426,6 +427,10 @@ class GreyFrames:
     def one(self, index: int) -> "GreyFrames":
         """One stack out of the batch, as a batch of one."""
         return replace(self._changed(lambda values: values[index : index + 1]), batched=False)
+
+    def some(self, where: Array) -> "GreyFrames":
+        """The stacks ``where`` (B,) is true."""
+        return self if where.all() else self._changed(lambda values: values[torch.from_numpy(where).to(values.device)])
 
     def with_timing(self, timing: SensorTiming) -> "GreyFrames":
         """The same stacks in the row order of another timing."""

@@ -215,13 +215,13 @@ EVERY = 4  # rows; every fourth row is enough to estimate a column pattern
 _LEAST_PATTERN = 3e-4
 
 
-def column_pattern(groups: list[tuple[RowSpectra, Tensor, Tensor, Tensor, Tensor]]) -> Tensor | None:
+def column_pattern(groups: list[tuple[RowSpectra, Tensor, Tensor, Tensor, Tensor]]) -> Tensor:
     """Spectrum (B, U), shrunk by its noise, of a pattern that every row of every frame has at the same columns.
 
     It is fixed to the sensor and biases displacements towards zero. In frames warped back by the motion, the pattern p
     appears as ``p(x + shift)`` while the scene stands still. For each frequency u, the differences of the frames d are
     therefore regressed on the differences r of ``exp(2 pi i u shift)``, which excludes the scene: ``p(u) = sum conj(r)
-    d / sum |r|^2``. None if no pattern is significant, or if it is too weak to bias displacements.
+    d / sum |r|^2``. 0 where no pattern is significant, or if it is too weak to bias displacements.
 
     The groups are spectra of frames, M of each stack, with the rows, shifts and visibility (B M, G, S each) that warp
     some of their rows, and the residual variance (B M, S) of these rows. Objects that move by themselves are left out:
@@ -258,4 +258,4 @@ def column_pattern(groups: list[tuple[RowSpectra, Tensor, Tensor, Tensor, Tensor
     u = groups[0][0].frequencies.to(power.dtype)
     scene = torch.stack([squared_modulus(spectra.values[:, :, ::16]).mean((1, 2)) for spectra, *_ in groups]).mean(0)
     slopes, of_scene = ((u.square() * values).sum(-1) for values in (squared_modulus(found), scene))
-    return found if bool((slopes > _LEAST_PATTERN * of_scene).any()) else None
+    return found * (slopes > _LEAST_PATTERN * of_scene)[:, None]

@@ -295,7 +295,7 @@ def row_time_of_tones(stack: GreyFrames, clock: CameraClock, options: Registrati
         measured = replace(frames, timing=timing).measure(motion)
         if not (measured.measurements.weights > 0).any():
             return None
-        if number == _ROUND_OF_PATTERN and (pattern := frames.column_pattern(motion, measured.gradients)) is not None:
+        if number == _ROUND_OF_PATTERN and (pattern := frames.column_pattern(motion, measured.row_variance())).any():
             frames = frames.without(pattern)
             measured = replace(frames, timing=timing).measure(motion)
         rows = _MeasuredRows.of(measured.measurements, num_frames, num_rows, row_time / clock.period)

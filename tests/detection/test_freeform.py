@@ -51,6 +51,7 @@ def test_observable_displacement_is_measured(found):
     assert (rms(error) < 0.4).all()
     assert found.reliable.all()
     assert found.findings == ((), ())
+    assert f"motion near multiples of {TIMING.frame_rate:.4g} Hz" in " ".join(found.summary().split())
 
 
 def test_standard_deviations_agree_with_errors(found):

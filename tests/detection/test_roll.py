@@ -93,6 +93,20 @@ def test_roll_is_measured_by_default(rolling, detection):
     torch.testing.assert_close(found.vibration.amplitude, detection.vibration.amplitude, rtol=5e-3, atol=0)
 
 
+def test_a_stack_of_a_batch_that_rolls_gives_all_stacks_the_same_components(rolling, detection):
+    without = FieldMotion((1.4, 1.9, 0.0, 0.0), TRUTH.frequency, TRUTH.phase)
+    frames = take_field_frames(draw_scene(304, 368, 12, blur=1.2), TIMING, without, SIZE, 4)
+    frames = frames + 0.004 * np.random.default_rng(6).standard_normal(frames.shape)
+    found = detect_vibration(torch.stack([torch.from_numpy(frames).float(), rolling[1]])[:, :, None], TIMING)
+    assert found.reliable[:, :2].all()
+    assert found.vibration.num_axes == 3
+    assert found.reliable[1, 2]
+    torch.testing.assert_close(found.vibration.amplitude[1], detection.vibration.amplitude, rtol=5e-3, atol=0)
+    torch.testing.assert_close(
+        found.vibration.amplitude[0, :2, 0], torch.tensor(without.amplitude[:2]).double(), rtol=5e-3, atol=0
+    )
+
+
 def test_roll_is_measured_by_default_where_detail_is_at_one_side():
     """Rows are then displaced along y as well, and their quarters unevenly: roll was not tried."""
     scene = draw_scene(304, 368, 12, blur=1.2)

@@ -18,7 +18,7 @@ from rsvib_torch import (
 from rsvib_torch.datasets import city_and_fields, example_frames
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.sensitivity import assumptions, timing_sensitivity
-from rsvib_torch.detection.tones.fit import displacement_std, fit_tones, vibration_of_fit
+from rsvib_torch.detection.tones.fit import amplitude_std, displacement_std, fit_tones, vibration_of_fit
 from rsvib_torch.detection.tones.uncertainty import with_further_tones, without_aliasing
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 
@@ -96,6 +96,24 @@ def test_intervals_contain_the_truth_where_a_second_tone_is_not_resolved(num_fra
     assert bool((displacement[:, 0] >= own[:, 0]).all())
     assert float(np.exp(np.log((displacement / own)[:, 0]).mean())) > 1.5
     np.testing.assert_allclose(allowing.fit.coefficients, fit.coefficients)
+
+
+@pytest.mark.parametrize("cycles", [0.2, 0.25, 1.3])
+def test_intervals_of_slow_tones_contain_the_truth(cycles):
+    """Of tones of less than half a period, linear deviations of the amplitude are several times too small."""
+    batch, generator, frequency = 300, np.random.default_rng(5), cycles * 24 / 5
+    phase, starts = generator.uniform(-3, 3, batch), starts_of(TIMING, 5)
+    truth = mean_sine(1.0, np.full(batch, frequency), phase, starts, TIMING.exposure_time)
+    fit = fitted(measured(truth, TIMING, generator, noise=0.02), np.full(batch, max(frequency, 2.0)))
+    (vibration, std), linear = vibration_of_fit(fit), torch.from_numpy(amplitude_std(fit))
+
+    def share_within(error, deviation):
+        return float((error.abs() < 1.96 * deviation)[:, 0].double().mean())
+
+    errors = vibration.amplitude - 1.0, vibration.frequency - frequency, vibration.image_motion
+    for error, deviation in zip(errors, (std.amplitude, std.frequency, std.image_motion), strict=True):
+        assert share_within(error, deviation) > 0.88
+    assert (share_within(errors[0], linear) < 0.75) == (cycles < 0.5)
 
 
 @pytest.mark.parametrize("num_frames", [2, 4])

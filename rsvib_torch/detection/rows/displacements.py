@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from rsvib_torch.detection.measurements import Measurements, trimmed_mean
 from rsvib_torch.detection.rows.warping import Positions, differently_blurred, exposure_paths, moments, warp_to_scene
@@ -23,9 +24,9 @@ from rsvib_torch.execution.parallel import chunks, runs
 from rsvib_torch.motion.motion import ColumnStrips, Motion
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.numerics.interpolation import extend_rows, fast_length
-from rsvib_torch.numerics.tables import Array, table, tables
+from rsvib_torch.numerics.tables import Array, table, tables, tensor
 from rsvib_torch.registration.gradients import BLOCK, RowGradients, residual_products, row_equations, row_gradients
-from rsvib_torch.registration.row_spectra import EVERY, RowSpectra, column_pattern, overlapping
+from rsvib_torch.registration.row_spectra import EVERY, RowSpectra, column_pattern, inner_columns, overlapping
 
 BLOCK_ROWS = 8  # rows of one measurement; tones up to 1 / (16 T_row) are resolved
 _MIN_OVERLAP = 0.5  # part of a frame that all frames of a group contain
@@ -294,15 +295,15 @@ def joined_groups(parts: list[MeasuredGroup], exposure_time: float, groups: int 
     return replace(measurements, displacements=measurements.relative(measurements.displacements))
 
 
-def column_pattern_of(
-    groups: list[FrameGroups], timing: RowTiming, motion: Motion, gradients: list[RowGradients]
-) -> Tensor | None:
-    """``column_pattern`` of every fourth row of all groups."""
+def column_pattern_of(groups: list[FrameGroups], timing: RowTiming, motion: Motion, row_variance: Array) -> Tensor:
+    """``column_pattern`` of every fourth row of all groups, whose rows have residual variances (B, M, S)."""
     parts = []
-    for group, of_group in zip(groups, gradients, strict=True):
+    ends = np.cumsum([group.count for group in groups])[:-1]
+    for group, of_group in zip(groups, np.split(row_variance[..., ::EVERY], ends, 1), strict=True):
         height, of_groups = group.spectra.height, group.motion_of_groups(motion)
         positions = Positions.of(group.starts_of_groups, height, timing, of_groups, EVERY)
-        visible, variance = positions.visible(height, BLOCK_ROWS // EVERY), of_group.variance[:, ::EVERY]
+        visible = positions.visible(height, BLOCK_ROWS // EVERY)
+        variance = tensor(of_group).flatten(0, 1).to(visible.device)
         spectra = group.spectra.in_groups(group.count)
         parts.append((spectra, positions.rows, positions.shift, visible, variance))
     return column_pattern(parts)
@@ -371,6 +372,9 @@ def displacements_of_parts(gradients: RowGradients, parts: int = 4) -> tuple[Ten
 # Contradictions of the exposure time
 
 _SCATTER_ROWS = 32  # px, rows whose errors of interpolation count as one
+# standard deviation of the ratio that residuals do not show: relative, by the second order (ratios of 1.05 to 1.22
+# were right behind exposures with paths of 1 to 8 px), and that of the difference over the detail
+_OF_RATIO, _OF_DETAIL = 0.1, 0.0007
 _LOWEST, _HIGHEST = 1 / 64, 0.15  # cycles/px; shading lies below, and a blur of 2 px is expanded to 20 % above
 
 
@@ -386,50 +390,9 @@ def blur_ratio(groups: list[FrameGroups], timing: RowTiming, motion: Motion) -> 
     Returns:
         (B, 3): ratio, its standard deviation, and the size of the expected difference relative to m.
     """
-    block = 2
-    parts: list[Tensor] = []
-    counts: list[Tensor] = []
-    for group in groups:
-        # 1. Coarse detail of the warped frames, and the second moments of the paths.
-        of_groups = group.motion_of_groups(motion)
-        positions = Positions.of(group.starts_of_groups, group.spectra.height, timing, of_groups)
-        u = group.spectra.frequencies
-        low = slice(int((u <= _LOWEST).sum()), int((u < _HIGHEST).sum()))
-        low_spectra = group.spectra.band(low).in_groups(group.count)
-
-        def averaged(values: Tensor) -> Tensor:
-            rows = values.shape[2] // block
-            of_blocks: Tensor = values[:, :, : rows * block].unflatten(2, (rows, block)).mean(3)
-            return 0.5 * of_blocks[:, :, 1:-1] + 0.25 * (of_blocks[:, :, :-2] + of_blocks[:, :, 2:])
-
-        spectra = averaged(low_spectra.warped(positions.rows, positions.shift))
-        second = averaged(moments(*exposure_paths(positions.exposure_starts, timing, of_groups), 2))
-        visible = averaged(positions.visible(group.spectra.height, BLOCK_ROWS))
-        both = (visible[:, 1:] * visible[:, :-1] == 1).double()
-        mean, difference = 0.5 * (spectra[:, 1:] + spectra[:, :-1]), spectra[:, 1:] - spectra[:, :-1]
-        weight = both.unfold(2, 5, 1).amin(-1)
-
-        # 2. The expected difference. Derivatives across rows are of fourth order, from two neighbours on each side.
-        inner = mean.shape[2] - 4
-        above_2, above, here, below, below_2 = (mean.narrow(2, row, inner) for row in range(5))
-        by_x = (2j * math.pi * u[low]).to(mean.dtype)
-        by_y = 8 / 12 * (below - above) - 1 / 12 * (below_2 - above_2)
-        by_yy = 16 / 12 * (below + above) - 1 / 12 * (below_2 + above_2) - 30 / 12 * here
-        change = (0.5 * (second[:, 1:] - second[:, :-1]))[:, :, 2:-2, None].to(by_x.dtype)
-        expected = (change[..., 0, 0] * by_x.square()) * here
-        expected += (2 * change[..., 0, 1] / block * by_x) * by_y
-        expected += (change[..., 1, 1] / block**2) * by_yy
-
-        # 3. Its products with the mean and with the measured difference.
-        values = torch.view_as_real(torch.stack([expected, here, difference[:, :, 2:-2]], -2)).flatten(-2)
-        of_rows = (values @ values.mT).double()  # (B M, G - 1, S, 3, 3)
-        of_rows, weight = (_of_stacks(part, group.count) for part in (of_rows, weight))
-        of_rows *= weight[..., None, None]
-        length = min(_SCATTER_ROWS // block, of_rows.shape[2])
-        of_parts = of_rows[:, :, : of_rows.shape[2] // length * length].unflatten(2, (-1, length)).sum(3)
-        parts.append(of_parts.flatten(1, 2))
-        counts.append(values.shape[-1] * weight.sum((1, 2)))
-    # 4. Least squares. The variance is that of the residuals, 8/3 of it because values share blocks, or by the scatter
+    found = (_products_of_blur(group, timing, group.motion_of_groups(motion)) for group in groups)
+    parts, counts = zip(*found, strict=True)
+    # Least squares. The variance is that of the residuals, 8/3 of it because values share blocks, or by the scatter
     # of the scores of parts if that is larger: errors of interpolation are alike in neighbouring rows.
     products, count = torch.cat(parts, 1), torch.stack(counts).sum(0).clamp(min=1.0)  # (B, M, 3, 3) of M parts
     total = products.sum(1)
@@ -442,4 +405,58 @@ def blur_ratio(groups: list[FrameGroups], timing: RowTiming, motion: Motion) -> 
     variance = 8 / 3 * inverse[:, 0, 0] * (square - (solution * right).sum(-1)).clamp(min=0.0) / count
     scores = products[:, :, :2, 2] - (products[:, :, :2, :2] @ solution[:, None, :, None])[..., 0]
     scatter = (scores @ inverse[:, 0, :, None]).square().sum((1, 2))
-    return torch.stack([solution[:, 0], torch.maximum(variance, scatter).sqrt(), scale[:, 0] / scale[:, 1]], -1)
+    ratio, size = solution[:, 0], scale[:, 0] / scale[:, 1]
+    unknown = (_OF_RATIO * ratio).square() + (_OF_DETAIL / size.clamp(min=1e-12)).square()
+    return torch.stack([ratio, (torch.maximum(variance, scatter) + unknown).sqrt(), size], -1)
+
+
+def _products_of_blur(group: FrameGroups, timing: RowTiming, motion: Motion) -> tuple[Tensor, Tensor]:
+    """Sums (B, M, 3, 3) over M parts of the products of expected difference, mean and measured difference of frames.
+
+    The motion is that of each group. Also the number of independent values, (B,).
+    """
+    block = 2
+    # 1. Coarse detail of the warped frames, and the second moments of the paths.
+    positions = Positions.of(group.starts_of_groups, group.spectra.height, timing, motion)
+    u = group.spectra.frequencies
+    low = slice(int((u <= _LOWEST).sum()), int((u < _HIGHEST).sum()))
+    low_spectra = group.spectra.band(low).in_groups(group.count)
+
+    def averaged(values: Tensor) -> Tensor:
+        rows = values.shape[2] // block
+        of_blocks: Tensor = values[:, :, : rows * block].unflatten(2, (rows, block)).mean(3)
+        return 0.5 * of_blocks[:, :, 1:-1] + 0.25 * (of_blocks[:, :, :-2] + of_blocks[:, :, 2:])
+
+    spectra = averaged(low_spectra.warped(positions.rows, positions.shift))
+    second = averaged(moments(*exposure_paths(positions.exposure_starts, timing, motion), 2))
+    visible = averaged(positions.visible(group.spectra.height, BLOCK_ROWS))
+    both = (visible[:, 1:] * visible[:, :-1] == 1).double()
+    mean, difference = 0.5 * (spectra[:, 1:] + spectra[:, :-1]), spectra[:, 1:] - spectra[:, :-1]
+    weight = both.unfold(2, 5, 1).amin(-1)
+
+    # 2. The expected difference. Derivatives across rows are of fourth order, from two neighbours on each side.
+    rows = mean.shape[2] - 4
+    above_2, above, here, below, below_2 = (mean.narrow(2, row, rows) for row in range(5))
+    by_x = (2j * math.pi * u[low]).to(mean.dtype)
+    by_y = 8 / 12 * (below - above) - 1 / 12 * (below_2 - above_2)
+    by_yy = 16 / 12 * (below + above) - 1 / 12 * (below_2 + above_2) - 30 / 12 * here
+    change = (0.5 * (second[:, 1:] - second[:, :-1]))[:, :, 2:-2, None].to(by_x.dtype)
+    expected = (change[..., 0, 0] * by_x.square()) * here
+    expected += (2 * change[..., 0, 1] / block * by_x) * by_y
+    expected += (change[..., 1, 1] / block**2) * by_yy
+
+    # 3. Its products with the mean and with the measured difference, in the columns that all frames contain: beyond
+    # them, frames continue without detail, which seemed to be a blur of up to 0.02 of the detail.
+    several = torch.stack([expected, here, difference[:, :, 2:-2]], -2)
+    samples = 2 * low.stop
+    place = torch.arange(samples, device=u.device) * group.spectra.length // samples
+    inner = inner_columns(group.spectra.width, positions.shift, u)
+    inner = functional.pad(inner, (0, group.spectra.length - group.spectra.width))[..., place]
+    values = torch.fft.irfft(functional.pad(several, (low.start, 1)), n=samples, norm="ortho")
+    values = values * inner[:, :, None, None].to(values.dtype)
+    of_rows = (values @ values.mT).double()  # (B M, G - 1, S, 3, 3)
+    of_rows, weight, share = (_of_stacks(part, group.count) for part in (of_rows, weight, inner.mean(-1)))
+    of_rows *= weight[..., None, None]
+    length = min(_SCATTER_ROWS // block, of_rows.shape[2])
+    of_parts = of_rows[:, :, : of_rows.shape[2] // length * length].unflatten(2, (-1, length)).sum(3)
+    return of_parts.flatten(1, 2), 2 * several.shape[-1] * share.mean(1) * weight.sum((1, 2))

@@ -75,6 +75,10 @@ class MeasuredRows:
             return uneven_motion(self.gradients, self.num_stacks)
         return self.differential()
 
+    def row_variance(self) -> Array:
+        """(B, M, S) residual variance of every row of M groups, see ``RowGradients``."""
+        return np.concatenate([table(part.variance.unflatten(0, (self.num_stacks, -1))) for part in self.gradients], 1)
+
     def aliasing(self) -> Array:
         """(B,) px, expected size of the bias by aliasing, see ``RowGradients``."""
         parts = [gradients.aliasing.unflatten(0, (self.num_stacks, -1)) for gradients in self.gradients]
@@ -127,15 +131,12 @@ class GroupedFrames:
         rows = self.rows_of(stacks)
         return replace(self, groups=[group.stacks(rows) for group in self.groups])
 
-    def column_pattern(self, motion: Vibration | FreeMotion, gradients: list[RowGradients]) -> Tensor | None:
+    def column_pattern(self, motion: Vibration | FreeMotion, row_variance: Array) -> Tensor:
         """Spectrum of a pattern of columns in each row of the batch, see ``column_pattern_of``."""
-        return column_pattern_of(self.groups, self.timing, self.view(motion), gradients)
+        return column_pattern_of(self.groups, self.timing, self.view(motion), row_variance)
 
-    def without(self, pattern: Tensor, stacks: Array | None = None) -> Self:
-        """The frames without a pattern of columns of all, or of some, stacks."""
-        if stacks is not None:
-            rows = len(self.groups[0].starts)
-            pattern = pattern.new_zeros(rows, pattern.shape[-1]).index_copy_(0, self.rows_of(stacks), pattern)
+    def without(self, pattern: Tensor) -> Self:
+        """The frames without a pattern of columns."""
         return replace(self, groups=[replace(group, spectra=group.spectra.without(pattern)) for group in self.groups])
 
     def suits(self, motion: Vibration) -> bool:
@@ -224,11 +225,9 @@ class GroupedStrips(GroupedFrames):
         count = len(self.columns)
         return super().rows_of((stacks[:, None] * count + np.arange(count)).ravel())
 
-    def column_pattern(self, motion: Vibration | FreeMotion, gradients: list[RowGradients]) -> Tensor | None:
+    def column_pattern(self, motion: Vibration | FreeMotion, row_variance: Array) -> Tensor:
         """As for whole rows: all strips of a row have the same noise."""
-        count = len(self.columns)
-        of_strips = [replace(part, variance=part.variance.repeat_interleave(count, 0)) for part in gradients]
-        return super().column_pattern(motion, of_strips)
+        return super().column_pattern(motion, np.repeat(row_variance, len(self.columns), 0))
 
     def view(self, motion: Vibration | FreeMotion) -> Motion:
         """The motions of the strips (B S)."""

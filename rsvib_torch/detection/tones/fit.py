@@ -396,7 +396,14 @@ def motion_of_fit(fit: ToneFit, device: torch.device | None = None) -> Vibration
 
 
 def vibration_of_fit(fit: ToneFit) -> tuple[Vibration, VibrationStd]:
-    """``motion_of_fit`` and its standard deviations to first order; 0 for tones that are not active."""
+    """``motion_of_fit`` and its standard deviations; 0 for tones that are not active.
+
+    They are of first order, but for uncertain frequencies. Rows determine the square of the frequency f of a slow tone,
+    and the inverse of an amplitude that depends on f, with symmetric errors; the image motion compensates a slow tone
+    in proportion to its period. The stated deviation of these is half of the distance to the limit that two standard
+    deviations give, at most 4.5 times the value.
+    """
+    # 1. First order.
     centre = fit.centre[:, None, None]
     real, imaginary, amplitude = _direction(fit)
     zero = np.zeros_like(real)
@@ -405,19 +412,32 @@ def vibration_of_fit(fit: ToneFit) -> tuple[Vibration, VibrationStd]:
         np.stack([zero, zero, zero + 1.0], -1),
         np.stack([-imaginary / amplitude, real / amplitude, zero - 2 * math.pi * centre], -1),
     ]
-    deviations = _propagated(fit, np.stack(gradients))
-    order = (-fit.amplitude).argsort(-1, stable=True)  # the order of the tones of a Vibration
-    amplitude_std, frequency_std, phase_std = np.take_along_axis(deviations, order[None], -1)
-    frequency = np.take_along_axis(np.where(fit.active, fit.frequencies, 0.0), order, -1)
-    period_std = frequency_std / np.square(np.where(frequency > 0, frequency, 1.0))
-    first = 3 * fit.frequencies.shape[-1]
-    drift = _covariance_of_axes(fit)[..., first:, first:]
+    amplitude_std, frequency_std, phase_std = _propagated(fit, np.stack(gradients))
+    frequency = np.where(fit.active & (fit.frequencies > 0), fit.frequencies, 1.0)
+    tones, axes = 3 * fit.frequencies.shape[-1], _covariance_of_axes(fit)
+    drift, by_frequency = axes[..., tones:, tones:], axes[..., 2:tones:3, :]  # covariances of each frequency
+    by_frequency = by_frequency / np.where(frequency_std > 0, frequency_std, np.inf)[..., None]
     of_motion, of_acceleration = drift[..., 0, 0], np.zeros_like(drift[..., 0, 0])
     if fit.drift.shape[-1] > 1:
         of_acceleration, to_origin = drift[..., 1, 1], centre[..., 0]
         of_motion = of_motion - 2 * to_origin * drift[..., 0, 1] + np.square(to_origin) * of_acceleration
+    # 2. The limits of f and of its period, relative to their values, and the amplitude and the image motion with them.
+    share = frequency_std / frequency
+    lower = np.sqrt(np.maximum(1 - 4 * share, 0.01))
+    longer = np.maximum(0.5 * (1 / lower - 1), share)
+    place = np.arange(frequency.shape[-1])
+    along = np.abs(real * by_frequency[..., place, 3 * place] + imaginary * by_frequency[..., place, 3 * place + 1])
+    larger = 0.5 * amplitude * (1 / np.maximum(1 - 2 * along / amplitude, 0.1) - 1)
+    other = np.sqrt(np.maximum(np.square(amplitude_std) - np.square(along), 0.0))
+    amplitude_std = np.hypot(other, np.maximum(larger, along))
+    growth = np.square(longer / np.maximum(share, 1e-300)) - 1
+    of_motion = of_motion + (np.square(by_frequency[..., tones]) * np.where(share > 0, growth, 0.0)).sum(-1)
+    frequency_std = np.maximum(0.5 * frequency * (1 - lower), frequency_std)
+    # 3. The order of the tones of a Vibration.
+    order = (-fit.amplitude).argsort(-1, stable=True)
+    of_tones = np.stack([amplitude_std, frequency_std, longer / frequency, phase_std]) * fit.active
     drift_std = np.sqrt(np.maximum([of_motion, of_acceleration], 0.0))
-    of_parameters = (amplitude_std, frequency_std, period_std, phase_std, *drift_std)
+    of_parameters = (*np.take_along_axis(of_tones, order[None], -1), *drift_std)
     return motion_of_fit(fit), VibrationStd(*map(tensor, of_parameters))
 
 
