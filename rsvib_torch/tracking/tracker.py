@@ -111,8 +111,7 @@ class _GreyFrame:
 
     def grey(self, timing: SensorTiming) -> Grey:
         """The frame (H, W) in image orientation as 8-bit counts, in which corners are followed."""
-        grey = frames_from_row_order(self.images[0, 0], timing).float().cpu().numpy()
-        return eight_bits(grey, np.percentile(grey[::4, ::4], (0.1, 99.9)))
+        return eight_bits(frames_from_row_order(self.images[0, 0], timing).cpu().numpy())
 
     def spectra(self, columns: slice) -> RowSpectra:
         """Spectra of the rows in some columns."""
