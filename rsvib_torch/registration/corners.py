@@ -194,8 +194,14 @@ def _stands_still(found: Points, rests: NDArray[np.bool_], shape: tuple[int, ...
     return bool((left and right) or (top and bottom))
 
 
-def eight_bits(frame: Array, levels: Array) -> Grey:
-    """A frame in 8 bits, in which OpenCV follows corners, between two levels that become 0 and 255."""
+def eight_bits(frame: Array, levels: Array | None = None) -> Grey:
+    """A frame in 8 bits, in which OpenCV follows corners, between two levels that become 0 and 255.
+
+    By default, nearly all pixels of the frame are between them, and NaN become 0.
+    """
+    if levels is None:  # the full scale may be far beyond the content
+        levels = np.nanpercentile(frame[::4, ::4], (0.1, 99.9))
+        frame = np.nan_to_num(frame, nan=levels[0])
     return np.asarray(np.interp(frame, levels, (0, 255)).round(), np.uint8)
 
 

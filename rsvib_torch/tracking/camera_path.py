@@ -95,16 +95,17 @@ def camera_path(
         continued = bool(windows) and any(tone.slope for tone in windows[-1].tones)
         if not has_tones or (window.residual < allowed and not continued):
             return found
-        for first in range(0, len(waiting) - _SHORT_FRAMES // 2, _SHORT_FRAMES // 2):
-            known = [pair for pair in waiting[first : first + _SHORT_FRAMES] if pair is not None]
-            if len(known) < _SHORT_FRAMES // 2:
-                return []
-            joined = Corners.joined(known)
-            if not windows or joined.times.mean() > windows[-1].origin:
-                found.append(fit_window(joined, timing.frame_period, averaged, readout, slopes=_SLOPES).path())
         least = (1.2 if continued else 0.5) * window.residual
         if window.other_readout is not None:  # tones that sweep explain less than the other readout does
             least = min(least, window.other_readout[2])
+        firsts = range(0, len(waiting) - _SHORT_FRAMES // 2, _SHORT_FRAMES // 2)
+        for first in firsts:
+            known = [pair for pair in waiting[first : first + _SHORT_FRAMES] if pair is not None]
+            if len(known) < _SHORT_FRAMES // 2 or 2 * sum(one.residual >= least for one in found) > len(firsts):
+                return []  # the median of all will not be less
+            joined = Corners.joined(known)
+            if not windows or joined.times.mean() > windows[-1].origin:
+                found.append(fit_window(joined, timing.frame_period, averaged, readout, slopes=_SLOPES).path())
         return found if found and np.median([one.residual for one in found]) < least else []
 
     fitted = 0

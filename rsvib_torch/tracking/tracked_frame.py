@@ -47,7 +47,6 @@ class TrackedTones:
     # displacements of the rows of the last frame that was measured and of the one before, with the same time origin
     measurements: Measurements
     findings: Findings  # reasons against each axis
-    apart: float  # px, by which the halves of the rows of the last measured frame move apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +59,8 @@ class TrackedFrame:
             ``"unusable"``: the frame is constant, or a copy of the frame before.
         motion: The motion to remove, in image axes; its time origin is the middle of the frame. Axes whose vibration is
             not reliable are still.
-        path: (2,) px, axes (x, y): image motion without the tones of ``motion`` from the first tracked frame to the
-            middle of this one; NaN if it is not known.
+        path: (2,) px, axes (x, y): image motion without the tones of ``motion``, from the first frame to the middle of
+            this one, by corners that are followed with ``steady``; NaN if it is not known.
         detected: Whether the vibration was searched for, as ``detect_vibration`` does, after this frame.
         measurements: Displacements of the rows of this frame and of the frame before, in row order; times count
             from the first row of this frame. None if they were not measured.
@@ -145,7 +144,7 @@ class TrackedFrame:
 
     @property
     def _as_taken(self) -> bool:
-        return self.tones is None and not bool(self.motion.image_shift.any())
+        return not bool(self.motion.moving_axes().any())
 
     @property
     def _timed_from_middle(self) -> PreparedFrames:

@@ -37,7 +37,9 @@ _FINE = 64  # frequencies that are compared at a time
 MIN_RATIO = 60.0  # of the variance that a tone explains and that of the rest; compression and parallax reach 40
 _MIN_EXPLAINED = 0.03  # px rms, of the offsets that a tone explains; smaller ones are not visible in a video
 _LOWEST = 0.6  # of the frame rate; the path follows slower motion
-_HIGHEST = 2000.0  # Hz; rows that are read nearly at once would resolve any frequency, and the search would not end
+# Hz, or frame rates if that is more; rows that are read nearly at once would resolve any frequency, and the search
+# would not end. With 2000 Hz alone, a tone of 2300 Hz at 1000 frames per second became two others
+_HIGHEST, _FRAME_RATES = 2000.0, 4.0
 _MIN_GAIN = 0.15  # |2 sin(pi f T)|; tones close to a multiple of the frame rate hardly change from frame to frame
 # Tones of at most this gain of which more is left in a third of the rows or columns are left out: 0.1 to 0.8 of 20 of
 # 24 tones by objects that move in some rows, below 0.03 of tones of cameras at such frequencies
@@ -387,7 +389,8 @@ class WindowFit:
         Also whether the exposure leaves a tone of a frequency (F,), and whether it changes from frame to frame (F,).
         """
         step = 0.3 / (self.times.max() - self.times.min())
-        frequencies = np.arange(_LOWEST / self.interval, min(0.5 * _CELLS / readout, _HIGHEST), step)
+        highest = min(0.5 * _CELLS / readout, max(_HIGHEST, _FRAME_RATES / self.interval))
+        frequencies = np.arange(_LOWEST / self.interval, highest, step)
         is_resolved = np.abs(np.prod(np.sinc(frequencies[:, None] * np.array(self.averaged)), 1)) > _MIN_SINC
         is_visible = is_resolved & (_gain(frequencies, self.interval) > _MIN_GAIN)
         return frequencies, is_resolved, is_visible

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
-from itertools import chain, count, groupby, islice
+from itertools import count, groupby
 from pathlib import Path
 
 import numpy as np
@@ -33,10 +33,9 @@ from rsvib_torch.stacks.run_folder import FileRun, RunFolder, StackReport
 from rsvib_torch.video import Margins
 from rsvib_torch.video.first_pass import PART_FRAMES
 from rsvib_torch.video.video_frames import Frame, FrameTrack, VideoFrames
-from rsvib_torch.video.video_passes import VideoMotion, left_alone, shakes_more, video_motion
+from rsvib_torch.video.video_passes import VideoMotion, VideoPart, shakes_more, video_motion
 
 _TOGETHER = ("joint", "scale", "mosaic", "optics")  # options of restore that frames one by one do not have
-_JUDGED_FRAMES = 4  # of each part, whose shaking decides whether it is restored
 
 # What the manifest states of the alignment of a gyroscope.
 _OF_GYROSCOPE = ("orientation", "offset", "offset_std", "scale", "bias", "focal_length", "focal_length_std")
@@ -63,7 +62,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
 
     Tones that sweep are followed in windows of 24 frames, where others leave more than 0.3 px.
 
-    Of a part of 32 frames whose first ones would shake more than as taken, rows are not moved apart: no vibration, and
+    Of a part of 32 frames whose first eight would shake more than as taken, rows are not moved apart: no vibration, and
     with ``steady`` no wobble, is undone. Frames that cannot be decoded and constant frames are replaced by the frame
     before (at the beginning of a part by the one behind them); copies of the frame before are moved along the smooth
     path. The video is encoded in parts in the folder ``.NAME.rsvib`` beside it, from which an interrupted run is
@@ -218,7 +217,7 @@ class _SecondPass:
     info: StackInfo  # of the video to write
     margins: Margins | None  # which are cut off
     progress: Callable[[], None]
-    worse: set[int] = field(default_factory=set)  # parts that are left alone
+    parts: dict[int, VideoPart] = field(default_factory=dict)  # that are not yet in the folder
 
     def run(self, at_once: int) -> None:
         """Restore a number of frames at the same time."""
@@ -226,7 +225,7 @@ class _SecondPass:
         threads = 1 if self.motion.frames.job.options.device == "cpu" else torch.get_num_threads()
         with closing(in_threads(self._restored, self._missing(), at_once=at_once, threads=threads)) as frames:
             for part, of_part in groupby(frames, lambda one: one[0].index // PART_FRAMES):
-                self._encode(part, of_part)
+                self._encode(self.parts.pop(part), of_part)
 
     def _missing(self) -> Generator[tuple[FrameTrack, Frame | str], None, None]:
         """The frames to restore, with what is removed from them."""
@@ -237,37 +236,32 @@ class _SecondPass:
                     for _ in frames:
                         self.progress()
                     continue
-                tracked = ((motion.track(index), frame) for index, frame in frames)
-                first = list(islice(tracked, _JUDGED_FRAMES))
-                if motion.is_worse(part, [track for track, _ in first]):
-                    self.worse.add(part)
-                for track, frame in chain(first, tracked):
-                    yield left_alone(track) if part in self.worse else track, frame
+                self.parts[part] = motion.part(part)
+                for track, (_, frame) in zip(self.parts[part].tracks, frames, strict=True):
+                    yield track, frame
 
     def _restored(self, track: FrameTrack, frame: Frame | str) -> _Restored:
         return track, None if isinstance(frame, str) else self.motion.frames.restored(frame, track)
 
-    def _encode(self, part: int, frames: Iterator[_Restored]) -> None:
+    def _encode(self, part: VideoPart, frames: Iterator[_Restored]) -> None:
         """Encode the frames of a part, and enter it in the folder."""
         layout, folder = self.motion.frames, self.folder
-        name = f"{part:06d}{folder.sink.suffix.lower()}"
-        tracks: list[FrameTrack] = []
+        name = f"{part.number:06d}{folder.sink.suffix.lower()}"
         shown: Frame | None = None  # the last frame that could be used
         with part_of_video(folder.create(name), folder.sink, self.info, layout.picture) as write:
-            for track, planes in frames:
-                if tracks:
+            for number, (track, planes) in enumerate(frames):
+                if number:
                     self.progress()  # the frame before is complete
                 if planes is not None and track.fault is None:
                     is_first, shown = shown is None, layout.frame(_cut(planes, self.margins))
-                    for _ in range(len(tracks) if is_first else 0):  # those before it could not be used
+                    for _ in range(number if is_first else 0):  # those before it could not be used
                         write(shown)
                 if shown is not None:
                     write(shown)
-                tracks.append(track)
             if shown is None:
-                for _ in tracks:
+                for _ in part.tracks:
                     write(layout.frame(_cut(layout.black(), self.margins)))
-        folder.add(self.motion.record(part, tracks, is_worse=part in self.worse), [name])
+        folder.add(self.motion.record(part), [name])
         self.progress()
 
 

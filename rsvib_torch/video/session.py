@@ -31,8 +31,8 @@ class LiveReport:
     """What happened in a session."""
 
     frames: int = 0  # that were written
-    tracked: int = 0  # frames whose motion was known
-    corrected: int = 0  # frames from which tones were removed
+    tracked: int = 0  # frames whose motion, or path, was known
+    corrected: int = 0  # frames whose rows or content were moved
     predicted: int = 0  # tracked frames whose motion was predicted and not measured, because they were late
     unusable: int = 0  # frames that were constant, or copies
     dropped: int = 0  # frames that arrived and were dropped, because processing was too slow
@@ -165,8 +165,8 @@ def _tracked(
         is_late = drops and time.perf_counter() - frame.arrived > 0.5 * tracker.timing.frame_period
         tracked = tracker.update(frame.pixels, frame.time, measure=not is_late)
         is_tracked = tracked.state == "tracking"
-        report.tracked += is_tracked
-        report.corrected += bool(tracked.motion.amplitude.any())
+        report.tracked += is_tracked or bool(tracked.path.isfinite().all())
+        report.corrected += bool(tracked.motion.moving_axes().any())
         report.predicted += is_tracked and tracked.measurements is None
         report.unusable += tracked.state == "unusable"
         report.detections += tracked.detected

@@ -86,10 +86,7 @@ class VideoFrames:
         """The frame as 8-bit counts (H, W), in which corners are followed."""
         luma: Array = self.planes(frame)[0]
         luma = luma if luma.ndim == 2 else luma.mean(0)
-        if luma.dtype == np.uint8:
-            return luma.astype(np.uint8, copy=False)
-        levels = np.nanpercentile(luma[::4, ::4], (0.1, 99.9))  # the full scale may be far beyond the content
-        return eight_bits(np.nan_to_num(luma, nan=levels[0]), levels)
+        return luma.astype(np.uint8, copy=False) if luma.dtype == np.uint8 else eight_bits(luma)
 
     def planes(self, frame: Frame) -> list[Frame]:
         """Planes (..., H, W): all pixels, or Y (H, W) and the chroma (2, H / 2, W / 2)."""

@@ -38,6 +38,17 @@ _SMALLEST = 0.02  # px at the corners; roll and zoom below are left out, because
 
 
 @dataclass(frozen=True, eq=False)
+class VideoPart:
+    """What is removed from the frames of a part of a video."""
+
+    number: int
+    tracks: list[FrameTrack]
+    # ``WindowRecord.shaking``, from its first frames; None if it is unknown
+    shaking: dict[str, tuple[float, ...]] | None
+    is_worse: bool = False  # whether its rows are left as taken, because it would shake more otherwise
+
+
+@dataclass(frozen=True, eq=False)
 class VideoMotion:
     """The motion of all frames of a video: what is removed, where frames are moved to, verdict and record of parts."""
 
@@ -47,9 +58,20 @@ class VideoMotion:
     removed: Callable[[int], Vibration | FreeMotion]  # from a frame, the middle of which is the time origin
     is_steady: bool  # whether the frames are moved to a smooth path
 
-    def track(self, index: int) -> FrameTrack:
-        """What is removed from a frame."""
-        return FrameTrack(index, self.removed(index), self.found.faults.get(index))
+    def part(self, number: int) -> VideoPart:
+        """A part. It is left alone if restoration makes its first frames shake more.
+
+        If their shaking is unknown, it is if path and tones do not explain the corners of the part.
+        """
+        first = number * PART_FRAMES
+        indices = range(first, min(first + PART_FRAMES, len(self.frames.starts)))
+        tracks = [FrameTrack(index, self.removed(index), self.found.faults.get(index)) for index in indices]
+        shaking = self._shaking(tracks)
+        is_worse = any(shakes_more(*both) for both in shaking.values()) if shaking else not self.is_explained(number)
+        if not is_worse or not isinstance(self.path, CameraPath):
+            return VideoPart(number, tracks, shaking)
+        tracks = [_left_alone(track) for track in tracks]
+        return VideoPart(number, tracks, self._shaking(tracks), is_worse=True)
 
     def is_explained(self, part: int) -> bool:
         """Whether the path of the camera and tones explain the corners of a part."""
@@ -73,8 +95,8 @@ class VideoMotion:
 
     # Whether restoration helps, and the record of a part
 
-    def shaking(self, tracks: list[FrameTrack]) -> dict[str, tuple[float, ...]] | None:
-        """``WindowRecord.shaking`` from frames that follow each other; None if it is unknown.
+    def _shaking(self, tracks: list[FrameTrack]) -> dict[str, tuple[float, ...]] | None:
+        """``VideoPart.shaking`` of frames that follow each other.
 
         Before and after are of the same corners: in other frames, others are found, some of them on cars that pass.
         """
@@ -103,21 +125,10 @@ class VideoMotion:
             places.append(places_at_rest(track.motion, recorded, starts, exposure))
         return replace(corners, places=0.5 * (places[0] + places[1]), offsets=places[1] - places[0])
 
-    def is_worse(self, part: int, tracks: list[FrameTrack]) -> bool:
-        """Whether restoration makes a part shake more, by its first frames.
-
-        If it is unknown, whether path and tones do not explain the corners of the part.
-        """
-        if not isinstance(self.path, CameraPath):
-            return False
-        measured = self.shaking(tracks)
-        if measured is None:
-            return not self.is_explained(part)
-        return any(shakes_more(*both) for both in measured.values())
-
-    def record(self, part: int, tracks: list[FrameTrack], *, is_worse: bool) -> WindowRecord:
-        """The record of a part of the video, which was left alone if restoration makes it worse."""
-        path, first, last = self.path, tracks[0].index, tracks[-1].index
+    def record(self, part: VideoPart) -> WindowRecord:
+        """The record of a part of the video."""
+        tracks, shaking, path = part.tracks, part.shaking, self.path
+        first, last = tracks[0].index, tracks[-1].index
         detection = None
         if isinstance(path, CameraPath):
             detection = part_detection(self.frames, path, self.found.taken, slice(first, last + 1))
@@ -131,11 +142,10 @@ class VideoMotion:
                 if not sizes.any()
             ]
         moved = any(bool(track.motion.moving_axes().any()) for track in tracks if track.fault is None)
-        shaking = self.shaking(tracks)
         helps = shaking is not None and any(after < before for before, after in shaking.values())
-        outcome = "worse" if is_worse else "helps" if helps else None
+        outcome = "worse" if part.is_worse else "helps" if helps else None
         return WindowRecord(
-            window=part,
+            window=part.number,
             first=first,
             last=last,
             start_time=float(self.frames.starts[first]),
@@ -230,7 +240,7 @@ def shakes_more(before: float, after: float) -> bool:
     return after > _MORE_SHAKING * before + _VISIBLE_SHAKING
 
 
-def left_alone(track: FrameTrack) -> FrameTrack:
+def _left_alone(track: FrameTrack) -> FrameTrack:
     """What is removed from a frame of a part that restoration makes worse: rows are not moved apart."""
     if not isinstance(track.motion, Vibration):
         return track

@@ -8,7 +8,7 @@ from scipy.ndimage import map_coordinates, spline_filter
 from truth import draw_scene
 
 from rsvib_torch import SensorTiming, calibrate_row_time_by_motion
-from rsvib_torch.registration.corners import CornerFollower
+from rsvib_torch.registration.corners import CornerFollower, Corners
 from rsvib_torch.tracking.camera_path import camera_path, shake
 from rsvib_torch.video.steadying import largest_displacement, steady_shifts
 
@@ -194,6 +194,28 @@ def test_a_vibration_of_the_zoom_is_no_tone_along_x():
     frames = recorded({}, subject=False, zoom=(0.006, 64.0))
     tones = fitted(frames)[1].windows[0].tones
     assert all(tone.axis == 1 and tone.apart > 0.25 for tone in tones)  # refused: the halves move apart
+
+
+@pytest.mark.parametrize("rate", [1000.0, 5000.0])
+@pytest.mark.parametrize("wobble", [0.0, 0.6])  # px, of corners that move by themselves: other readouts are tried
+def test_tones_of_fast_cameras_are_found(rate, wobble):
+    """Up to 2000 Hz were searched: two other tones were found at 1000 frames per second, and 5000 ended in an error."""
+    frequency, random, height, width = 2.3 * rate, np.random.default_rng(1), 240, 320
+    timing = SensorTiming(row_time=0.6 / rate / height, exposure_rows=2, frame_rows=height / 0.6)
+    pairs = []
+    for number in range(40):
+        places = random.uniform([-width / 2, -height / 2], [width / 2, height / 2], (150, 2))
+        rows = places[:, 1] / height + 0.5
+        times = (number + np.arange(2) + 0.6 * rows[:, None]) / rate
+        moved = np.diff(np.sin(2 * np.pi * frequency * times), axis=1) * [1.0, 0.0]
+        offsets = moved + random.normal(0.0, 0.1 + wobble, (150, 2))
+        every = np.ones(150, bool)
+        pairs.append(Corners(0 * rows.astype(int), rows, times, places, offsets, every, np.zeros((150, 4, 4))))
+    (window,) = camera_path(pairs, timing, (height, width)).windows
+    (tone,) = window.tones
+    assert tone.frequency == pytest.approx(frequency, rel=1e-3)
+    assert tone.size == pytest.approx(1.0, abs=0.1)
+    assert window.other_readout is None
 
 
 def test_a_subject_on_two_fifths_of_the_frame_is_not_followed():

@@ -114,8 +114,8 @@ def test_every_frame_is_restored_with_times_and_sound(clip, tmp_path):
 def test_a_part_that_restoration_makes_worse_is_left_as_it_is(frames, tmp_path):
     """The frames by which the second part is judged do not vibrate; the tones are those of all frames."""
     paused = frames.copy()
-    noise = np.random.default_rng(1).normal(0, 3, paused[PART : PART + 4].shape)  # without it, they are copies
-    paused[PART : PART + 4] = ((255 * STILL).transpose(1, 2, 0) + noise).round().clip(0, 255)
+    noise = np.random.default_rng(1).normal(0, 3, paused[PART : PART + 8].shape)  # without it, they are copies
+    paused[PART : PART + 8] = ((255 * STILL).transpose(1, 2, 0) + noise).round().clip(0, 255)
     clip = write(tmp_path / "clip.mp4", paused)
     report = process_video(clip, tmp_path / "still.mp4", TIMING, **OPTIONS)
     windows = read_manifest(report.manifest).windows
