@@ -29,7 +29,6 @@ _LARGEST_MOTION = 0.25  # of the longer side, which the coarsest level of the py
 _AROUND = 31
 _MAX_RETURN = 0.3  # px, between a corner and the point where the way back from the other frame ends
 _MOST_PIXELS = 700_000  # of a frame in which corners are followed; the sides of larger ones are halved
-_MOST = 256  # corners of a pair of frames; with 480, clips take twice the time and become no steadier
 _MIN_CORNERS = 8  # of a pair of frames; four components are determined, and wrong matches are rejected
 # Of the corners of a pair, or of those that were followed, that agree on one motion: at night, 130 of 150 corners are
 # noise that is not followed, and 20 lights agree. Of 700 pairs of unrelated frames, a third of them dark, 21 have as
@@ -88,11 +87,12 @@ class Corners:
 class CornerFollower:
     """Follows the corners that move with most others from each frame of a video to the next, as long as they are seen.
 
-    Frames are reduced if they are large. To compare the blur of the corners takes a fifth of the time.
+    Frames are reduced if they are large. ``most`` is the number of corners of a pair of frames; with 480, clips take
+    twice the time and become no steadier. To compare the blur of the corners takes a fifth of the time.
     """
 
-    def __init__(self, timing: SensorTiming, *, compare_blur: bool = False) -> None:
-        self._timing, self._compare_blur = timing, compare_blur
+    def __init__(self, timing: SensorTiming, *, most: int = 256, compare_blur: bool = False) -> None:
+        self._timing, self._most, self._compare_blur = timing, most, compare_blur
         self._start = 0.0  # s, of the frame before
         self._before: Grey | None = None  # the frame before, of reduced size
         self._known, self._votes = _NO_CORNERS  # corners in it, and the votes of each of them, see ``_in_layer``
@@ -113,7 +113,7 @@ class CornerFollower:
         self._known, self._votes = _NO_CORNERS
         if before is None:
             return None
-        found = find_corners(before, _MOST, known)
+        found = find_corners(before, self._most, known)
         votes = np.pad(voted, (0, len(found) - len(voted)))
         ends, good = follow_corners(before, second, found)
         found, ends, votes = found[good], ends[good], votes[good]
