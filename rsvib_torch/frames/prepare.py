@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import Channels, FramesLike, FramesOrFiles, as_tensor, channel_axis, check_pixels
-from rsvib_torch.checks.values import beyond_full_scale, check_number
+from rsvib_torch.checks.values import check_number
 from rsvib_torch.frames.entry_points import load_frames
+from rsvib_torch.frames.full_scale import scaled_counts
 from rsvib_torch.frames.pixels import (
     are_mosaics,
     check_mosaic,
@@ -284,24 +285,12 @@ def as_float_frames(
         raise ValueError(f"at least {minimum_frames} frames are needed, got {count}{remedy}")
     if min(frames.shape) == 0:
         raise ValueError(f"{name} must not be empty, got shape {tuple(frames.shape)}")
-    if frames.dtype.is_complex or frames.dtype == torch.bool:
-        remedy = f"; pass {name}.float()" if frames.dtype == torch.bool else ""
-        raise TypeError(f"{name} must be real numbers, got {frames.dtype}{remedy}")
+    if frames.dtype == torch.bool:
+        raise TypeError(f"{name} must be real numbers, got {frames.dtype}; pass {name}.float()")
     if frames.dtype.is_floating_point:
         check_pixels(name, frames)
         return frames if frames.dtype == torch.float64 else frames.to(torch.float32)
-    if full_scale is None:
-        if frames.dtype != torch.uint8:
-            raise ValueError(
-                f"full scale of {str(frames.dtype).removeprefix('torch.')} {name} unknown: pass full_scale, e.g. "
-                "full_scale=4095 for 12-bit counts (commands: --full-scale 4095)"
-            )
-        full_scale = 255.0
-    full_scale = check_number("full_scale", full_scale, above=0.0)
-    counts = frames.to(torch.float32)  # PyTorch finds no largest value of some integers
-    if counts.numel() and (largest := float(counts.max())) > _MOST_COUNTS * full_scale:
-        raise ValueError(f"{name}: {beyond_full_scale(int(largest), full_scale)}")
-    return counts / full_scale
+    return scaled_counts(frames, full_scale, name, most=_MOST_COUNTS)
 
 
 def _missing_pixels(frames: Tensor, ignore: object, allow_missing: bool, axis: int) -> Tensor | None:

@@ -18,7 +18,7 @@ from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile, putchunk
 
 from rsvib_torch.io.frame_reader import FrameError, FrameReader, check_held, readable_stack
-from rsvib_torch.io.full_scale import known_full_scale
+from rsvib_torch.frames.full_scale import known_full_scale
 from rsvib_torch.io.stack_info import DIFFERENT, StackInfo, Tag, exif_fields
 from rsvib_torch.io.tiff import open_tiff, write_tiff
 from rsvib_torch.numerics.tables import Array

@@ -18,7 +18,7 @@ from rsvib_torch.frames.entry_points import LoadedFrames
 from rsvib_torch.io.formats import find_format
 from rsvib_torch.io.frame_reader import FrameReader, part_reader
 from rsvib_torch.io.frame_times import timing_from_first_frame
-from rsvib_torch.io.full_scale import counts_to_frames, full_scale_of_counts
+from rsvib_torch.frames.full_scale import counts_to_frames, required_full_scale
 from rsvib_torch.io.stack_info import StackInfo, split_range
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array
@@ -165,4 +165,4 @@ def load_files(paths: Sequence[PathLike], full_scale: float | None) -> LoadedFra
 
     if pixels.dtype.kind == "f":
         return LoadedFrames(torch.from_numpy(pixels), None, timed)
-    return LoadedFrames(pixels, full_scale_of_counts(pixels, full_scale, str(paths[0])), timed)
+    return LoadedFrames(pixels, required_full_scale(full_scale, pixels.dtype, paths[0]), timed)

@@ -12,7 +12,7 @@ from rsvib_torch.checks.values import check_choice
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.files.atomic import check_outputs, check_target, check_writable, whole
 from rsvib_torch.io.formats import FORMATS, StackFormat, target_format
-from rsvib_torch.io.full_scale import check_dtype, frames_to_counts, known_full_scale, required_full_scale
+from rsvib_torch.frames.full_scale import check_dtype, frames_to_counts, known_full_scale, required_full_scale
 from rsvib_torch.io.stack_info import DIFFERENT, StackInfo, split_range
 from rsvib_torch.numerics.tables import Array
 
@@ -156,7 +156,7 @@ def write_stack(
     if not frames.dtype.is_floating_point:
         stored = np.dtype(str(frames.dtype).removeprefix("torch."))
         check_dtype(stored)
-        full_scale = required_full_scale(known_full_scale(stored, full_scale), stored, "frames")
+        full_scale = required_full_scale(full_scale, stored, "frames")
         dtype = dtype or stored.name
         frames = frames.to(torch.float64) / full_scale  # exact for integers of 32 bits
     axis = channel_axis("frames", frames.shape, channels)
