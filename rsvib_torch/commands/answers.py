@@ -144,7 +144,7 @@ def check_folder(
     """Raise an error if results, among them a stack ``output``, exist in a folder or would replace an input."""
     stack = [] if output is None else io.stack_files(output)
     check_new([*(folder / name for name in dict.fromkeys(names)), *stack], overwrite, inputs, folder=folder)
-    check_writable(folder, folder=True)
+    check_writable(folder, "folder")
 
 
 def remove_old(folder: Path, results: Iterable[str], names: Iterable[str]) -> None:

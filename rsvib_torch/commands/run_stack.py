@@ -16,7 +16,7 @@ from rsvib_torch.commands import answers
 from rsvib_torch.commands.flat_command import Given, argument
 from rsvib_torch.commands.shared_options import PixelSizeOptions, RestoringCommand, VerdictOptions
 from rsvib_torch.commands.terminal import Answer, current_output, warn, working
-from rsvib_torch.files.atomic import whole_folder
+from rsvib_torch.files.atomic import whole
 from rsvib_torch.files.reading import Table
 from rsvib_torch.options import ProcessVideoOptions, StackOptions
 from rsvib_torch.text import number_of, printable
@@ -98,7 +98,7 @@ def run(given: RunCommand) -> Answer:
     stored, first = stacks.read_manifest(result.manifest), result.first
     # 2. Figure, tables and page.
     page = _video_page(given, stored) if first is None else _window_page(given, first, stored)
-    with whole_folder(out) as folder:
+    with whole(out, "folder") as folder:
         drawn = []
         if len(page.frames):
             with working("drawing the frames"):

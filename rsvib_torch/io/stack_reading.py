@@ -15,10 +15,10 @@ from rsvib_torch.checks.arguments import PathLike, checks_arguments
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.files.reading import check_fits
 from rsvib_torch.frames.entry_points import LoadedFrames
+from rsvib_torch.frames.full_scale import counts_to_frames, required_full_scale
 from rsvib_torch.io.formats import find_format
 from rsvib_torch.io.frame_reader import FrameReader, part_reader
 from rsvib_torch.io.frame_times import timing_from_first_frame
-from rsvib_torch.frames.full_scale import counts_to_frames, required_full_scale
 from rsvib_torch.io.stack_info import StackInfo, split_range
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array

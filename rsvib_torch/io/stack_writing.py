@@ -11,8 +11,8 @@ from rsvib_torch.checks.arguments import Channels, FramesLike, PathLike, as_tens
 from rsvib_torch.checks.values import check_choice
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.files.atomic import check_outputs, check_target, check_writable, whole
-from rsvib_torch.io.formats import FORMATS, StackFormat, target_format
 from rsvib_torch.frames.full_scale import check_dtype, frames_to_counts, known_full_scale, required_full_scale
+from rsvib_torch.io.formats import FORMATS, StackFormat, target_format
 from rsvib_torch.io.stack_info import DIFFERENT, StackInfo, split_range
 from rsvib_torch.numerics.tables import Array
 
@@ -39,7 +39,7 @@ def check_info_target(
     if info.is_integer:
         required_full_scale(info.full_scale, np.dtype(info.dtype), path)
     if check_folder:
-        check_writable(path, folder=form.kind == "folder")
+        check_writable(path, form.kind)
     return form
 
 
@@ -90,7 +90,7 @@ def write_frames(
 ) -> None:
     """Write a stack from its frames as stored; it gets its name when it is complete and on the disk."""
     assert form.write is not None
-    with whole(path, form.kind) as part:
+    with whole(path, form.kind, parent_exists=False) as part:
         form.write(part, info, frames, compression)
 
 

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from rsvib_torch.checks.arguments import PathLike
 from rsvib_torch.checks.values import check_choice
+from rsvib_torch.frames import full_scale as scales
 from rsvib_torch.frames.pixels import check_mosaic, colour_frames, enlarged
 from rsvib_torch.frames.prepare import largest_count
-from rsvib_torch.frames import full_scale as scales
 from rsvib_torch.io.frame_reader import FrameError, FrameReader
 from rsvib_torch.io.frame_times import exposure_times, timing_of_stack
 from rsvib_torch.io.stack_info import StackInfo

@@ -225,7 +225,7 @@ class FileRun:
         """
         atomic.make_folder(self.manifest.parent)
         manifest = StackManifest(**self.header, **stated, windows=tuple(folder.records()))
-        with atomic.whole_file(self.manifest) as part:
+        with atomic.whole(self.manifest) as part:
             manifest.save(part)
             yield manifest
         sync(self.manifest.absolute().parent)  # the temporary folder is gone as well

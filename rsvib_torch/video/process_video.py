@@ -12,7 +12,7 @@ import torch
 from rsvib_torch.checks.arguments import PathLike
 from rsvib_torch.checks.values import fields_of
 from rsvib_torch.execution.parallel import in_threads
-from rsvib_torch.files.atomic import whole_file
+from rsvib_torch.files.atomic import whole
 from rsvib_torch.frames.entry_points import file_options
 from rsvib_torch.gyroscope.gpmf_track import read_camera_track
 from rsvib_torch.gyroscope.read_gyroscope import read_gyroscope
@@ -150,7 +150,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
             gyroscope = {name: plain_values(getattr(motion.path, name)) for name in _OF_GYROSCOPE}
         not_kept = metadata_not_kept(job.info, sink, content.shape)
         stated = {"margins": margins and asdict(margins), "gyroscope": gyroscope, "not_kept": not_kept}
-        with run.writing(folder, **stated) as manifest, whole_file(sink) as part:
+        with run.writing(folder, **stated) as manifest, whole(sink) as part:
             join_parts(part, content, map(folder.open, folder.files()))
     return run.report(manifest, resumed)
 
