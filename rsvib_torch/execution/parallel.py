@@ -188,10 +188,7 @@ def prefetched(items: Generator[Item, None, None], count: int, threads: int = 1)
     """
     with _pool(1, threads, items) as pool:
         waiting = deque(pool.submit(list, islice(items, 1)) for _ in range(count + 1))
-        while True:
-            made = waiting.popleft().result()
-            if not made:  # there are no further items
-                return
+        while made := waiting.popleft().result():  # empty if there are no further items
             yield made[0]
             waiting.append(pool.submit(list, islice(items, 1)))
 

@@ -39,7 +39,7 @@ from rsvib_torch.stacks.window_restoration import (
     restore_trusted,
     without_data,
 )
-from rsvib_torch.stacks.windows import StoredWindow, Window, WindowRecord, WindowResult, cut_windows, window_timing
+from rsvib_torch.stacks.windows import Window, WindowRecord, WindowResult, cut_windows, window_timing
 
 WindowFrames = list[Array | str]  # pixels as stored, or why a frame cannot be read
 
@@ -130,10 +130,10 @@ class StackJob:
             taken, frames = taken[: len(kept)], frames[: len(kept)]
         return replace(result, frames=frames if self.info.nodata is None else without_data(frames, taken))
 
-    def compute_stored(self, window: Window, pixels: WindowFrames) -> StoredWindow:
-        """``compute``, and the frames as they are stored: those that were not restored are unchanged.
+    def compute_stored(self, window: Window, pixels: WindowFrames) -> tuple[WindowRecord, Array, WindowResult | None]:
+        """The record of a window, its frames as the file has them, and the result of the first window of the stack.
 
-        A frame that cannot be read is stored as NaN, or 0 for integers.
+        Frames that were not restored are unchanged. One that cannot be read is stored as NaN, or 0 for integers.
         """
         result, dtype = self.compute(window, pixels), np.dtype(self.info.dtype)
 
@@ -156,7 +156,7 @@ class StackJob:
             written = [middle] if self.is_joined else window.written
             frames = [counts(restored[index]) if index in restored else as_taken(index) for index in written]
         record, first = WindowRecord.of(result, self.timing, len(frames)), result if window.index == 0 else None
-        return StoredWindow(record, np.ascontiguousarray(np.stack(frames)), first)  # channels may be stored last
+        return record, np.ascontiguousarray(np.stack(frames)), first  # channels may be stored last
 
     def _unchanged(self, frames: Tensor) -> Tensor:
         """Frames that were not restored, in the shape of restored ones."""
@@ -254,7 +254,4 @@ def plan_job(
     joint, most = job.chosen.joint, min(stated.window, info.shape[0])
     if joint is not True and joint > most:
         raise ValueError(f"joint must be at most {most}, the number of frames of a window, got {joint}")
-    at_once = windows_at_once(
-        info, stated.window, restoration, memory=options.memory, workers=options.workers, on_gpu=device != "cpu"
-    )
-    return job, windows, at_once
+    return job, windows, windows_at_once(info, stated)

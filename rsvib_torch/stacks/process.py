@@ -151,13 +151,13 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
         first: WindowResult | None = None
         count = _counter(options.progress, windows, missing)
         with closing(_in_threads(job, job.compute_stored, missing, at_once)) as results:
-            for window, made in zip(missing, results, strict=True):
-                records.append(made.record)
-                first = first or made.result
+            for window, (record, frames, result) in zip(missing, results, strict=True):
+                records.append(record)
+                first = first or result
                 if _all_failed(records, len(windows)):
                     folder.remove()
                     raise ValueError(records[0].error)
-                folder.add(made.record, array=made.frames)
+                folder.add(record, array=frames)
                 count(window.kept)
         # 4. The output from the windows in the folder, and the manifest.
         with run.writing(folder, not_kept=metadata_not_kept(job.info, sink, out.shape)) as manifest:
