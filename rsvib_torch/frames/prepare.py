@@ -9,7 +9,7 @@ the user gave float64).
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, TypeVar
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -33,8 +33,6 @@ from rsvib_torch.motion.timing import RowTiming, SensorTiming, check_timing, row
 from rsvib_torch.options import MaskedInputOptions
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
-
-Entry = TypeVar("Entry")
 
 
 def frames_to_row_order(frames: Tensor, timing: SensorTiming) -> Tensor:
@@ -73,18 +71,6 @@ def magnitudes_from_row_order(values: Tensor, timing: SensorTiming, axis: int = 
     return values[..., order] if axis == -1 else values[..., order, :]
 
 
-def sequence_from_row_order(values: Sequence[Entry], timing: SensorTiming) -> tuple[Entry, ...]:
-    """Turn one entry for each component, back to image axes.
-
-    Example:
-        >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512, scan_axis="x")
-        >>> sequence_from_row_order(["along the row", "along the scan"], timing)
-        ('along the scan', 'along the row')
-    """
-    order, _ = row_axes(timing, len(values))
-    return tuple(values[axis] for axis in order)
-
-
 def reasons_from_row_order(reasons: Sequence[Reason], timing: SensorTiming) -> tuple[Reason, ...]:
     """Reasons with the names of their axes in the image."""
     order, _ = row_axes(timing, len(AXIS_NAMES))
@@ -96,7 +82,8 @@ def findings_from_row_order(
     findings: Sequence[Sequence[Reason]], timing: SensorTiming
 ) -> tuple[tuple[Reason, ...], ...]:
     """Turn the reasons against each component back to image axes."""
-    return sequence_from_row_order([reasons_from_row_order(reasons, timing) for reasons in findings], timing)
+    order, _ = row_axes(timing, len(findings))
+    return tuple(reasons_from_row_order(findings[axis], timing) for axis in order)
 
 
 Saturation = float | Literal["auto"] | None
