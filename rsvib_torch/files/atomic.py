@@ -195,10 +195,6 @@ def _places(path: _Path) -> set[Path]:
     return {Path(os.path.realpath(path)), Path(os.path.realpath(path.parent), path.name)}
 
 
-def _inside(path: _Path, folder: _Path) -> bool:
-    return any(place != above and place.is_relative_to(above) for place in _places(path) for above in _places(folder))
-
-
 def _same_file(path: _Path, other: _Path) -> bool:
     with suppress(OSError):  # one of them does not exist
         return os.path.samefile(path, other)
@@ -207,9 +203,12 @@ def _same_file(path: _Path, other: _Path) -> bool:
 
 def _relation(path: _Path, other: _Path) -> str:
     """How a file to write is related to one that this would change; empty if it is not."""
-    if _same_file(path, other) or not _places(path).isdisjoint(_places(other)):
+    places, others = _places(path), _places(other)
+    if _same_file(path, other) or not places.isdisjoint(others):
         return "is"
-    return "contains" if _inside(other, path) else "lies inside" if _inside(path, other) else ""
+    if any(not places.isdisjoint(place.parents) for place in others):
+        return "contains"
+    return "lies inside" if any(not others.isdisjoint(place.parents) for place in places) else ""
 
 
 def check_outputs(outputs: Iterable[_Path], inputs: Iterable[_Path], *, folder: _Path | None = None) -> None:
@@ -223,7 +222,7 @@ def check_outputs(outputs: Iterable[_Path], inputs: Iterable[_Path], *, folder: 
         check_not_special(output)
     for source in inputs:
         places = [(f"cannot write {output}", output, "name") for output in outputs]
-        if folder is not None and (os.path.isdir(source) or not _inside(source, folder)):
+        if folder is not None and (os.path.isdir(source) or _relation(folder, source) != "contains"):
             places.insert(0, (f"cannot write into {folder}", folder, "folder"))
         for problem, place, remedy in places:
             relation, member = _relation(place, source), None

@@ -10,7 +10,7 @@ import torch
 from rsvib_torch.checks.arguments import Channels, FramesLike, PathLike, as_tensor, channel_axis, checks_arguments
 from rsvib_torch.checks.values import check_choice
 from rsvib_torch.execution.progress import steps
-from rsvib_torch.files.atomic import check_outputs, check_target, check_writable, whole
+from rsvib_torch.files.atomic import check_outputs, check_target, whole
 from rsvib_torch.frames.full_scale import check_dtype, frames_to_counts, known_full_scale, required_full_scale
 from rsvib_torch.io.formats import FORMATS, StackFormat, target_format
 from rsvib_torch.io.stack_info import DIFFERENT, StackInfo, split_range
@@ -23,11 +23,11 @@ def stack_files(path: PathLike) -> list[Path]:
 
 
 def check_info_target(
-    path: Path, info: StackInfo, compression: str | None = None, *, check_folder: bool = True
+    path: Path, info: StackInfo, compression: str | None = None, *, parent_exists: bool = True
 ) -> StackFormat:
-    """The format in which ``path`` is written, or the error of writing; ``check_folder``: its folder must exist."""
+    """The format in which ``path`` is written, or the error of writing; ``parent_exists`` as in ``check_target``."""
     form = target_format(path)
-    check_target(path, form.kind, parent_exists=False)
+    check_target(path, form.kind, parent_exists=parent_exists)
     if info.dtype not in form.dtypes:
         raise ValueError(f"{path}: {form.name} files hold {', '.join(form.dtypes)}; got dtype {info.dtype}")
     if compression is not None:
@@ -38,8 +38,6 @@ def check_info_target(
         form.check(path, info)
     if info.is_integer:
         required_full_scale(info.full_scale, np.dtype(info.dtype), path)
-    if check_folder:
-        check_writable(path, form.kind)
     return form
 
 

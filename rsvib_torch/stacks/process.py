@@ -134,7 +134,7 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
     job, windows, at_once = plan_job(source, timing, options)
     out = job.info.with_frames(len(windows) if job.is_joined else job.info.shape[0])
     out = job.content(out.restored_as(job.chosen.scale, job.chosen.mosaic), timing)
-    form = check_info_target(sink, out, compression, check_folder=False)
+    form = check_info_target(sink, out, compression, parent_exists=False)
     run = FileRun(sink, options, manifest_header(job, sink.name, compression), stack_files(source))
     # 2. A complete output is not computed again.
     finished = run.finished()

@@ -106,7 +106,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         raise ValueError(f"{sink}: videos are written to {', '.join(CONTAINERS)}")
     content = job.content(job.info, timing)
     if border != "crop":
-        check_info_target(sink, content, check_folder=False)
+        check_info_target(sink, content, parent_exists=False)
     header = manifest_header(job, sink.name, None)
     header["settings"] |= {
         "window": None,  # for the commands that read manifests: parts are not windows of their own
@@ -141,7 +141,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         if margins is not None:
             kept = margins.cut(torch.empty(content.shape[-2:], device="meta")).shape
             content = replace(content, shape=(*content.shape[:-2], *kept))
-        check_info_target(sink, content, check_folder=False)
+        check_info_target(sink, content, parent_exists=False)
         _SecondPass(motion, folder, content, margins, progress).run(at_once)
         parts = range(-(-len(frames.starts) // PART_FRAMES))
         _check_shaking(folder, is_explained=any(map(motion.is_explained, parts)))
