@@ -140,10 +140,7 @@ def _process(given: RunCommand) -> stacks.StackReport:
 
 def _process_video(given: RunCommand) -> stacks.StackReport:
     """Process a video from frame to frame."""
-    restoration = dict(given.of_stack["restoration"])
-    if {**given.settings.restoration, **given.restoration}.get("saturation") in (None, "auto"):
-        restoration.pop("saturation", None)  # that of integer formats
-    of_run = given.of_stack | given.moved | {"restoration": restoration, "manifest": given.out / "manifest.json"}
+    of_run = given.of_stack | given.moved | {"manifest": given.out / "manifest.json"}
     with working(f"restoring {given.frames.name}", counts=True) as progress:
         return video.process_video(given.frames, given.restored, given.settings.timing, **of_run, progress=progress)
 

@@ -164,9 +164,9 @@ class StackJob:
         return enlarged(frames if mosaic is None else colour_frames(frames, mosaic), self.chosen.scale)
 
     def _for_counts(self, frames: Tensor) -> RestorationOptions:
-        """The options of ``restore``: with the largest count of fewer bits in place of full scale."""
+        """The options of ``restore``, with the level at which the counts of the file are saturated by themselves."""
         full_scale = self.options.full_scale
-        if self.chosen.saturation != 1.0 or full_scale is None:
+        if self.chosen.saturation != "auto" or full_scale is None:
             return self.chosen
         counts = (frames * full_scale).round().nan_to_num(0.0).to(torch.int64)
         return replace(self.chosen, saturation=largest_count(counts, full_scale) / full_scale)
