@@ -447,7 +447,7 @@ def grey_frames(
         around = torch.nn.functional.avg_pool2d(valid.to(images.dtype), 3, 1, 1)
         valid = _unless_complete(valid | (around > _MEASURED_AROUND))
     # a frame without detail has no displacement
-    for stack, frame in _constant(images).nonzero().tolist():
+    for stack, frame in is_constant(images.amin((2, 3, 4)), images.amax((2, 3, 4))).nonzero().tolist():
         place, remedy = f"{frame}{of_stack(stack)}", "leave out this stack" if prepared.batched else "remove this frame"
         raise ValueError(f"{constant_frame(place)}; {remedy}")
     # a copy of a frame was exposed at another time than its place in the stack states
@@ -475,9 +475,8 @@ def constant_frame(place: int | str) -> str:
     return f"frame {place} is constant and cannot be registered"
 
 
-def _constant(frames: Tensor) -> Tensor:
-    """(B, T) bool, frames (B, T, C, H, W) with equal pixels, to rounding."""
-    low, high = frames.amin((-3, -2, -1)), frames.amax((-3, -2, -1))
+def is_constant(low: Tensor, high: Tensor) -> Tensor:
+    """Whether the pixels between the lowest and the highest one are equal, to rounding."""
     return high - low <= 1e-6 * torch.maximum(low.abs(), high.abs())
 
 

@@ -33,10 +33,10 @@ from rsvib_torch.options import (
 from rsvib_torch.restoration.restore import check_optics
 from rsvib_torch.stacks.memory import windows_at_once
 from rsvib_torch.stacks.window_restoration import (
-    frame_fault,
     known_motion,
     measured_motion,
     restore_trusted,
+    usable_frame,
     without_data,
 )
 from rsvib_torch.stacks.windows import Window, WindowRecord, WindowResult, cut_windows, window_timing
@@ -83,17 +83,20 @@ class StackJob:
     def compute(self, window: Window, pixels: WindowFrames) -> WindowResult:
         """Detect the vibration in a window, restore its frames and judge the result."""
         # 1. The frames that can be used.
-        options, read = self.options, dict(zip(window.frames, pixels, strict=True))
-        found = ((index, frame_fault(read[index], index, options.full_scale, self.info.nodata)) for index in read)
-        faults = {index: fault for index, fault in found if fault is not None}
-        usable = {index: one for index, one in read.items() if index not in faults and not isinstance(one, str)}
-        kept = tuple(index for index in usable if index in window.written)
-        taken = self._images(list(usable.values()))
+        options, images, faults = self.options, dict[int, Tensor](), dict[int, str]()
+        for index, stored in zip(window.frames, pixels, strict=True):
+            try:
+                images[index] = usable_frame(stored, index, options.full_scale, self.info.nodata)
+            except ValueError as error:
+                faults[index] = str(error)
+        kept = tuple(index for index in images if index in window.written)
+        none = torch.empty((0, *self.info.shape[1:]), dtype=torch.float32, device="cpu")
+        taken = (torch.stack(list(images.values())) if images else none).to(options.device)
         bad = {index: fault for index, fault in faults.items() if index in window.written}
         result = WindowResult(window, kept, self._unchanged(taken[: len(kept)]), None, None, None, bad)
-        if faults and len(usable) < 2:
+        if faults and len(images) < 2:
             return replace(result, error=next(iter(faults.values())))
-        timing = window_timing(self.timing, window, list(usable))
+        timing = window_timing(self.timing, window, list(images))
         try:
             # 2. Their motion.
             if self.given is None:
@@ -146,7 +149,8 @@ class StackJob:
                 frame = np.full(self.info.shape[1:], np.nan if dtype.kind == "f" else 0, dtype)
             if self.chosen.scale == 1 and self.chosen.mosaic is None:
                 return frame
-            return counts(self._unchanged(self._as_taken(frame[None]))[0])  # the shape of restored ones
+            taken = scales.counts_to_frames(frame[None], self.options.full_scale, str(self.source), self.info.nodata)
+            return counts(self._unchanged(taken)[0])  # the shape of restored ones
 
         if result.restored and self.is_joined:
             frames = list(counts(result.frames))
@@ -170,15 +174,6 @@ class StackJob:
             return self.chosen
         counts = (frames * full_scale).round().nan_to_num(0.0).to(torch.int64)
         return replace(self.chosen, saturation=largest_count(counts, full_scale) / full_scale)
-
-    def _images(self, frames: Sequence[Array]) -> Tensor:
-        """Frames as stored as (T, H, W) or (T, C, H, W), full scale 1."""
-        if not frames:
-            return torch.empty((0, *self.info.shape[1:]), dtype=torch.float32, device="cpu")
-        return self._as_taken(np.stack(frames)).to(self.options.device)
-
-    def _as_taken(self, stored: Array) -> Tensor:
-        return scales.counts_to_frames(stored, self.options.full_scale, str(self.source), self.info.nodata)
 
 
 def stored_frame(read: Callable[[int], Array], index: int) -> Array | str:

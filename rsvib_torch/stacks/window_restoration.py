@@ -9,14 +9,14 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks.values import MAX_NUMBER, beyond_full_scale
+from rsvib_torch.checks.arguments import check_pixels
 from rsvib_torch.detection import MotionDetection, detect_motion, detect_vibration
 from rsvib_torch.detection.shapes.free import vibration_in_place_of
-from rsvib_torch.frames.prepare import constant_frame, prepare_frames
+from rsvib_torch.frames.full_scale import counts_to_frames
+from rsvib_torch.frames.prepare import constant_frame, is_constant, prepare_frames
 from rsvib_torch.imaging.sensor_model import sharpened
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
@@ -35,26 +35,19 @@ from rsvib_torch.results.reason import Reason
 # --- Frames ---
 
 
-def frame_fault(frame: Array | str, index: int, full_scale: float | None, nodata: float | None) -> str | None:
-    """Why a frame as stored, or the error of reading it, cannot be used; None if it can be."""
-    if isinstance(frame, str):
-        return frame
-    is_float = frame.dtype.kind == "f"
-    valued = frame if nodata is None else frame[frame != frame.dtype.type(nodata)]
-    valid = (valued.size - (int(np.isnan(valued).sum()) if is_float else 0)) / frame.size
+def usable_frame(stored: Array | str, index: int, full_scale: float | None, nodata: float | None) -> Tensor:
+    """Pixels of a stored frame with full scale 1; the ``ValueError`` states why it cannot be used, or was not read."""
+    if isinstance(stored, str):
+        raise ValueError(stored)
+    frame = counts_to_frames(stored, full_scale, f"frame {index}", nodata)
+    missing = torch.isnan(frame)
+    valid = 1.0 - float(missing.double().mean())
     if valid < 0.1:
-        return f"frame {index} has only {valid:.1%} of pixels that count"
-    if is_float and len(infinite := np.argwhere(np.isinf(frame))):
-        place = tuple(int(i) for i in infinite[0])
-        return f"frames must be finite, but pixel {(index, *place)} is {float(frame[place])}"
-    low, high = float(np.nanmin(valued)), float(np.nanmax(valued))
-    if not is_float and full_scale is not None and high > full_scale:
-        return f"{beyond_full_scale(round(high), full_scale)} (frame {index})"
-    largest = max(abs(high), abs(low))
-    if largest > MAX_NUMBER:
-        return f"frame {index} reaches {largest:.3g}, at most {MAX_NUMBER:g} is possible"
-    rounding = 1e-7  # of float32, relative
-    return constant_frame(index) if high - low <= rounding * largest else None
+        raise ValueError(f"frame {index} has only {valid:.1%} of pixels that count")
+    check_pixels(f"pixels of frame {index}", frame.masked_fill(missing, 0.0))
+    if is_constant(*frame[~missing].aminmax()):
+        raise ValueError(constant_frame(index))
+    return frame
 
 
 # --- Motion ---
