@@ -57,7 +57,7 @@ def stack_answer(frames: Path, found: detection.DetectionResult, pixel_size: flo
 def warn_of_restoration(result: stacks.RestoredFrames) -> None:
     """Print a warning if there is nothing to restore, or if restoration does not help or may not."""
     kept = "the frames are written unchanged"
-    if not result.moves:
+    if not result.restored and result.verdict is None:
         warn(f"no vibration was found that can be removed: {kept}")
     elif result.verdict is not None and result.verdict.overall in ("partly", "worse"):
         unchanged = "" if result.restored else f"; {kept}, --force writes the restored ones"
@@ -76,7 +76,7 @@ def restoration_lines(result: stacks.RestoredFrames, count: int) -> list[str]:
         lines.append(result.verdict.sentence)
     elif result.restored:
         lines.append("cannot determine whether restoration helps: no two frames show the same scene")
-    elif not result.moves:
+    else:
         lines.append("no vibration was found that can be removed")
     for reason in result.left_alone:
         is_above = reason.code == "axis_not_reliable"  # its reasons were printed before

@@ -10,7 +10,7 @@ from copy import copy
 from dataclasses import is_dataclass
 from functools import cache, wraps
 from importlib import import_module
-from itertools import islice
+from itertools import chain, islice
 from threading import Lock
 from types import ModuleType
 from typing import ParamSpec, TypeVar, cast
@@ -139,31 +139,25 @@ def in_parallel(
             return [work(item) for item in items]
     inference = torch.is_inference_mode_enabled()
     waiting = enumerate(items)  # each of the threads takes the next one
-    results: dict[int, Result] = {}
-    errors: dict[int, BaseException] = {}
 
-    def take_part() -> None:
+    def take_part() -> list[tuple[int, Result]]:
         torch.set_num_threads(min(within, allowed // threads))  # of this thread
         with torch.inference_mode(inference), torch.no_grad():
-            for place, item in waiting:
-                try:
-                    results[place] = work(item)
-                except BaseException as error:
-                    errors[place] = error
-                    for _ in waiting:  # no thread begins another item
-                        pass
+            try:
+                return [(place, work(item)) for place, item in waiting]
+            except BaseException:
+                deque(waiting, maxlen=0)  # no thread begins another item
+                raise
 
     try:
         # a new pool each time, because a kept one would not survive a fork; this thread takes part, because the C
         # library keeps the memory that it frees for the next call, but may return that of other threads
         with ThreadPoolExecutor(threads - 1) as pool:
-            for _ in range(threads - 1):
-                pool.submit(take_part)
-            take_part()
+            others = [pool.submit(take_part) for _ in range(threads - 1)]
+            made = take_part()
     finally:
         torch.set_num_threads(within)  # the initial value of threads that are started later
-    if errors:
-        raise errors[min(errors)]
+    results = dict(chain(made, *(other.result() for other in others)))
     return [results[place] for place in range(len(items))]
 
 

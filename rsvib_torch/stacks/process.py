@@ -157,7 +157,7 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
                 if _all_failed(records, len(windows)):
                     folder.remove()
                     raise ValueError(records[0].error)
-                folder.add(record, array=frames)
+                folder.add(record, frames)
                 count(window.kept)
         # 4. The output from the windows in the folder, and the manifest.
         with run.writing(folder, not_kept=metadata_not_kept(job.info, sink, out.shape)) as manifest:

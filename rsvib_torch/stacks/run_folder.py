@@ -19,7 +19,7 @@ import shutil
 import stat
 import time
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -82,7 +82,7 @@ class RunFolder:
 
     def __init__(self, sink: Path, header: Mapping[str, object], *, resume: bool) -> None:
         self.path, self.sink, self._above = work_folder(sink), sink, nearest_folder(sink)
-        self._finished: dict[int, tuple[WindowRecord, list[str]]] = {}  # record and names of the files of windows
+        self._finished: dict[int, tuple[WindowRecord, str]] = {}  # record and name of the file of every window
         self._key = _blake2b(json.dumps(header, sort_keys=True).encode()).digest()
         make_folder(self.path.parent)
         with ExitStack() as opened:
@@ -124,7 +124,7 @@ class RunFolder:
                 if entry is not None and all(self._digest(file) == digest for file, digest in entry["files"].items()):
                     record = decode(WindowRecord, entry["record"], name)
                     if name == f"{record.window:06d}.json":
-                        self._finished[record.window] = record, list(entry["files"])
+                        self._finished[record.window] = record, next(iter(entry["files"]))
         if stored != header:
             self._write(_SETTINGS, header)
 
@@ -188,21 +188,19 @@ class RunFolder:
                 os.fsync(file.fileno())
             return hashlib.file_digest(file, _blake2b).hexdigest()  # type: ignore[arg-type]
 
-    def add(self, record: WindowRecord, names: Sequence[str] = (), array: Array | None = None) -> None:
-        """Enter the record of a window with its closed files, and an array, which becomes the last of them.
+    def add(self, record: WindowRecord, pixels: Array | str) -> None:
+        """Enter the record of a window and its pixels: an array, or the name of a file, which is closed.
 
-        Their names begin with the number of the window in six digits. It is on the disk when the function returns.
+        The name begins with the number of the window in six digits. Both are on the disk when the function returns.
         """
-        names = list(names)
-        if array is not None:
-            names.append(f"{record.window:06d}.npy")
-            with self.create(names[-1]) as file:
-                np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(array))
-                file.write(array.data)  # errors of np.save do not contain the reason
-        digests = {name: self._digest(name, synchronised=True) for name in names}
-        content = {"record": plain_values(record), "files": digests}
+        name = pixels if isinstance(pixels, str) else f"{record.window:06d}.npy"
+        if not isinstance(pixels, str):
+            with self.create(name) as file:
+                np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(pixels))
+                file.write(pixels.data)  # errors of np.save do not contain the reason
+        content = {"record": plain_values(record), "files": {name: self._digest(name, synchronised=True)}}
         self._write(f"{record.window:06d}.json", content, self._key)
-        self._finished[record.window] = record, names
+        self._finished[record.window] = record, name
 
     def __contains__(self, window: int) -> bool:
         return window in self._finished
@@ -218,7 +216,7 @@ class RunFolder:
 
     def files(self) -> list[str]:
         """Names of the files of the finished windows in order."""
-        return [name for window in sorted(self._finished) for name in self._finished[window][1]]
+        return [self._finished[window][1] for window in sorted(self._finished)]
 
     def frames(self) -> Iterator[Array]:
         """Frames of the finished windows in order, from the files of arrays."""

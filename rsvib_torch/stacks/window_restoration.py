@@ -185,8 +185,8 @@ class RestoredFrames:
     frames: Tensor  # to write: restored, or as taken
     restored: bool  # whether they are restored
     left_alone: tuple[Reason, ...]  # a reason for each axis that was not restored
-    verdict: RestorationVerdict | None  # whether restoration helps; None if frames could not be compared
-    moves: bool  # whether there was a vibration to remove
+    # whether restoration helps; None if nothing moves, or frames could not be compared, which are restored then
+    verdict: RestorationVerdict | None
     axes: int = 2  # number of components of the motion: 2, 3 with roll, 4 with roll and zoom
     lost_rows: Mapping[int, int] = field(default_factory=dict)  # number for each of the frames that has some
 
@@ -223,7 +223,7 @@ def restore_trusted(
     lost = prepared.lost_rows()
     if not bool(vibration.moving_axes().any()):
         as_taken = unchanged_frames(prepared, joint, scale)
-        return RestoredFrames(as_taken, False, left_alone, None, False, lost_rows=lost)
+        return RestoredFrames(as_taken, False, left_alone, None, lost_rows=lost)
     warn_of_mosaic(prepared)
     restored = restore_prepared(prepared, vibration, options)
     verdict = None
@@ -234,7 +234,7 @@ def restore_trusted(
     if keep:
         restored = sharpened(restored, optics, scale)
     result = prepared.from_row_order(restored) if keep else unchanged_frames(prepared, joint, scale)
-    return RestoredFrames(result, keep, left_alone, verdict, True, vibration.num_axes, lost)
+    return RestoredFrames(result, keep, left_alone, verdict, vibration.num_axes, lost)
 
 
 def without_data(frames: Tensor, taken: Tensor) -> Tensor:

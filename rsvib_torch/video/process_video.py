@@ -267,7 +267,7 @@ class _SecondPass:
             if shown is None:
                 for _ in tracks:
                     write(layout.frame(_cut(layout.black(), self.margins)))
-        folder.add(self.motion.record(part, tracks, is_worse=part in self.worse), [name])
+        folder.add(self.motion.record(part, tracks, is_worse=part in self.worse), name)
         self.progress()
 
 
