@@ -39,26 +39,6 @@ def chunks(count: int, bytes_per_item: int, device: torch.device, *, multiple: i
     return runs(count, at_once(bytes_per_item * multiple, device) * multiple)
 
 
-def gathered(pieces: Iterable[tuple[slice, Tensor]], count: int, dim: int) -> Tensor:
-    """Join pieces of a tensor, each with its slice along ``dim``, to one tensor of ``count`` indices.
-
-    Each piece is copied as soon as it is computed, so that one piece at a time needs memory. Pieces that require
-    gradients, and those of a graph that is recorded, are concatenated. A piece that is the whole is returned.
-    """
-    kept: list[Tensor] = []
-    whole: Tensor | None = None
-    for place, piece in pieces:
-        if piece.shape[dim] == count:
-            return piece
-        if piece.requires_grad or torch.compiler.is_compiling():
-            kept.append(piece)
-            continue
-        if whole is None:
-            whole = piece.new_empty(*piece.shape[:dim], count, *piece.shape[dim + 1 :])
-        whole.narrow(dim, place.start, piece.shape[dim]).copy_(piece)
-    return torch.cat(kept, dim) if whole is None else whole
-
-
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
