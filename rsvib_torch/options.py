@@ -331,7 +331,8 @@ class StackOptions(StackDetectionOptions):
     """Options of ``iterate_stack``."""
 
     restoration: OptionTable = None
-    """Options of ``restore``, for frames whose full scale is 1. With ``joint=True``, every window becomes one image."""
+    """Options of ``restore``, for frames whose full scale is 1; without ``saturation``, integer frames are saturated at
+    the level of ``"auto"``. With ``joint=True``, every window becomes one image."""
     force: bool = False
     """Whether to keep restored frames even if they are judged worse than the raw ones."""
 

@@ -32,7 +32,7 @@ LAYERS: tuple[dict[str, str], ...] = (
     {"checks": "checks of what users give: values, groups of options (values.py), arrays, arguments"},
     {
         "numerics": "splines, Fourier transforms, banded systems, tables of fits",
-        "files": "durable writes, the locked folder of a run, bounded reads, paths of outputs, free memory",
+        "files": "durable writes, bounded reads, paths of outputs, free memory",
     },
     {"execution": "chunks, threads, progress, precision", "text": "numbers, tables and JSON as text"},
 )

@@ -22,7 +22,7 @@ from rich.console import Console
 import rsvib_torch as rsv
 from rsvib_torch.commands.answers import write_detection
 from rsvib_torch.commands.terminal import warnings_in_one_line, working
-from rsvib_torch.files.atomic import whole_folder
+from rsvib_torch.files.atomic import whole
 from rsvib_torch.report import Report, write_report_page
 from rsvib_torch.text import text_table
 
@@ -86,7 +86,7 @@ def run(name: str, options: argparse.Namespace, arguments: Sequence[str], consol
     }
     lines = compare(truth, detection.vibration)
     show(console, name, lines, quality)
-    with working(f"{name}: writing files and figures"), whole_folder(out) as folder:
+    with working(f"{name}: writing files and figures"), whole(out, "folder") as folder:
         rsv.write_stack(folder / "frames.tif", frames, dtype="uint16", full_scale=FULL_SCALE)
         rsv.write_stack(folder / "restored.tif", restored, dtype="uint16", full_scale=FULL_SCALE)
         write_detection(folder, detection, TIMING)

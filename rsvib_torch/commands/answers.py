@@ -64,7 +64,7 @@ def restoration_of(run: stacks.StackReport) -> tuple[list[str], Table]:
     verdict = result.verdict
     # 1. A warning if there is nothing to restore, or if restoration does not help or may not.
     unchanged = "the frames are written unchanged"
-    if not result.moves:
+    if not result.restored and verdict is None:
         warn(f"no vibration was found that can be removed: {unchanged}")
     elif verdict is not None and verdict.overall in ("partly", "worse"):
         warn(verdict.sentence + ("" if result.restored else f"; {unchanged}, --force writes the restored ones"))
@@ -79,7 +79,7 @@ def restoration_of(run: stacks.StackReport) -> tuple[list[str], Table]:
         lines.append(verdict.sentence)
     elif result.restored:
         lines.append("cannot determine whether restoration helps: no two frames show the same scene")
-    elif not result.moves:
+    else:
         lines.append("no vibration was found that can be removed")
     for reason in result.left_alone:
         is_above = reason.code == "axis_not_reliable"  # its reasons were printed before
@@ -143,7 +143,7 @@ def check_folder(
     """Raise an error if results, among them a stack ``output``, exist in a folder or would replace an input."""
     stack = [] if output is None else io.stack_files(output)
     check_new([*(folder / name for name in dict.fromkeys(names)), *stack], overwrite, inputs, folder=folder)
-    check_writable(folder, folder=True)
+    check_writable(folder, "folder")
 
 
 def remove_old(folder: Path, results: Iterable[str], names: Iterable[str]) -> None:

@@ -13,7 +13,7 @@ from rsvib_torch.commands import shared_options as shared
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.terminal import Answer, note, warn, working
 from rsvib_torch.config import read_config
-from rsvib_torch.files.atomic import whole_file
+from rsvib_torch.files.atomic import whole
 from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.cameras import camera_mode, find_cameras
 from rsvib_torch.motion.timing import SensorSection, SensorTiming
@@ -54,7 +54,7 @@ def init(given: InitOptions) -> Answer:
         raise ValueError("--camera and --row-time both state the row time; give one of them")
     shared.check_file(out, given.overwrite, io.stack_files(frames))
     text = _describe_camera(frames, given.sensor, given.camera)
-    with whole_file(out) as file:
+    with whole(out) as file:
         file.write_text(text, encoding="utf-8")
     return Answer({}, {}, [out], [answers.run_step(frames, Path("results"), ["--config", str(out)])])
 
@@ -262,7 +262,7 @@ def calibrate(given: CalibrateOptions) -> Answer:
     if out is None:
         steps.insert(0, "write these values into a configuration file with --out, or copy them")
     else:
-        with whole_file(out) as file:
+        with whole(out) as file:
             file.write_text(table, encoding="utf-8")
         steps.append(answers.next_step("detect a vibration", "detect", "FRAMES", "--config", out, "--out", "FOLDER"))
     rows = stack.shape[known["scan_axis"]]

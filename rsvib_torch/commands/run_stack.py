@@ -16,7 +16,7 @@ from rsvib_torch.commands import answers
 from rsvib_torch.commands.flat_command import Given, argument
 from rsvib_torch.commands.shared_options import PixelSizeOptions, RestoringCommand, VerdictOptions
 from rsvib_torch.commands.terminal import Answer, current_output, warn, working
-from rsvib_torch.files.atomic import whole_folder
+from rsvib_torch.files.atomic import whole
 from rsvib_torch.files.reading import Table
 from rsvib_torch.options import ProcessVideoOptions, StackOptions
 from rsvib_torch.text import number_of, printable
@@ -98,7 +98,7 @@ def run(given: RunCommand) -> Answer:
     stored, first = stacks.read_manifest(result.manifest), result.first
     # 2. Figure, tables and page.
     page = _video_page(given, stored) if first is None else _window_page(given, first, stored)
-    with whole_folder(out) as folder:
+    with whole(out, "folder") as folder:
         drawn = []
         if len(page.frames):
             with working("drawing the frames"):
@@ -140,10 +140,7 @@ def _process(given: RunCommand) -> stacks.StackReport:
 
 def _process_video(given: RunCommand) -> stacks.StackReport:
     """Process a video from frame to frame."""
-    restoration = dict(given.of_stack["restoration"])
-    if {**given.settings.restoration, **given.restoration}.get("saturation") in (None, "auto"):
-        restoration.pop("saturation", None)  # that of integer formats
-    of_run = given.of_stack | given.moved | {"restoration": restoration, "manifest": given.out / "manifest.json"}
+    of_run = given.of_stack | given.moved | {"manifest": given.out / "manifest.json"}
     with working(f"restoring {given.frames.name}", counts=True) as progress:
         return video.process_video(given.frames, given.restored, given.settings.timing, **of_run, progress=progress)
 

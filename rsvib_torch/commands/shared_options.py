@@ -220,7 +220,7 @@ class RestoringCommand(StackCommand):
     def _chosen(self) -> Table:
         """Options of ``restore``: those of the configuration file, replaced by those of the command line."""
         options, given = dict(self.settings.restoration), dict(self.restoration)
-        info, full_scale = self.info, self.scale
+        full_scale = self.scale if self.info.is_integer else None
         method: str = (options | given).get("method", "exact")
         if method != options.get("method", "exact"):  # other options belong to the configured method
             kept = ("saturation", *method_options(method))
@@ -231,10 +231,8 @@ class RestoringCommand(StackCommand):
             given["joint"] = given["joint"] == "all" or int(given["joint"])
         options |= given
         RestorationOptions(**options)  # raises an error for wrong ones
-        if options.get("saturation") == "auto":
-            del options["saturation"]
-        level = options.get("saturation", full_scale)  # None: no pixels are saturated
-        if info.is_integer and full_scale is not None and level is not None:  # of frames whose full scale is 1
+        level = options.get("saturation")
+        if full_scale is not None and isinstance(level, (float, int)):  # of frames whose full scale is 1
             options["saturation"] = level / full_scale
         return options
 

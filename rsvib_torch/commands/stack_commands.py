@@ -14,7 +14,7 @@ from rsvib_torch.commands import answers
 from rsvib_torch.commands import shared_options as shared
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.terminal import Answer, current_output, warn, working
-from rsvib_torch.files.atomic import check_writable, whole_folder
+from rsvib_torch.files.atomic import check_writable, whole
 from rsvib_torch.files.reading import Table
 from rsvib_torch.options import FreeMotionOptions, MotionUnit
 
@@ -55,7 +55,7 @@ def detect(given: DetectCommand) -> Answer:
     pixels, timing = load(given)
     with working("detecting the vibration"):
         result = detection.detect_vibration(pixels, timing, **settings.detection)
-    with whole_folder(out) as folder:
+    with whole(out, "folder") as folder:
         names = answers.write_detection(folder, result, timing, given.pixel_size)
     answer = answers.stack_answer(frames, result, given.pixel_size)
     answer.next_steps += answers.steps_after_detection(result, frames, settings, out / "vibration.json")
@@ -137,7 +137,7 @@ def restore(given: RestoreCommand) -> Answer:
     outputs = [*io.stack_files(given.restored), given.manifest]
     shared.check_new(outputs, given.replaces, [*given.inputs, vibration, given.motion, given.lens_profile])
     current_output().work = stacks.work_folder(given.restored)
-    check_writable(given.restored, folder=not given.restored.suffix)
+    check_writable(given.restored, "file" if given.restored.suffix else "folder")
     # 1. The vibration of all frames, or the motion on the clock of the frames.
     info, of_run = given.info, Table()
     if vibration is not None and given.motion is None:

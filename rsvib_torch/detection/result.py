@@ -26,7 +26,6 @@ from rsvib_torch.frames.prepare import (
     findings_from_row_order,
     magnitudes_from_row_order,
     offsets_from_row_order,
-    sequence_from_row_order,
 )
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
@@ -232,7 +231,6 @@ def assembled(
     vibration = scale.motion(motion_of_fit(fit)).from_row_order(timing)
     sensitivity = timing_sensitivity(fit, row_timing, num_frames, scale.height)
     sensitivity = sensitivity.mapped(lambda values: magnitudes_from_row_order(values, timing, -2))
-    heights = sequence_from_row_order(curve.heights, timing)
     residual = (curve.offsets - predicted).abs().nanmean(dim=(1, 2))
     reliable = [[not of_axis for of_axis in of_stack] for of_stack in findings]
     # The axes of a stack have one timing, which the rows of one of them may contradict.
@@ -250,7 +248,6 @@ def assembled(
             curve,
             offsets=offsets_from_row_order(curve.offsets * units, timing),
             std=None if curve.std is None else magnitudes_from_row_order(curve.std * units, timing),
-            heights=(heights[0], heights[1]),
         ),
         fitted=offsets_from_row_order(predicted * units, timing),
         gain=vibration.gain(interval),

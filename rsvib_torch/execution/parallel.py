@@ -10,7 +10,7 @@ from copy import copy
 from dataclasses import is_dataclass
 from functools import cache, wraps
 from importlib import import_module
-from itertools import islice
+from itertools import chain, islice
 from threading import Lock
 from types import ModuleType
 from typing import ParamSpec, TypeVar, cast
@@ -37,26 +37,6 @@ def at_once(bytes_per_item: int, device: torch.device, *, cpu_bytes: int = 2**23
 def chunks(count: int, bytes_per_item: int, device: torch.device, *, multiple: int = 1) -> list[slice]:
     """Slices of consecutive items, a multiple of ``multiple`` each, to be processed at a time, see ``at_once``."""
     return runs(count, at_once(bytes_per_item * multiple, device) * multiple)
-
-
-def gathered(pieces: Iterable[tuple[slice, Tensor]], count: int, dim: int) -> Tensor:
-    """Join pieces of a tensor, each with its slice along ``dim``, to one tensor of ``count`` indices.
-
-    Each piece is copied as soon as it is computed, so that one piece at a time needs memory. Pieces that require
-    gradients, and those of a graph that is recorded, are concatenated. A piece that is the whole is returned.
-    """
-    kept: list[Tensor] = []
-    whole: Tensor | None = None
-    for place, piece in pieces:
-        if piece.shape[dim] == count:
-            return piece
-        if piece.requires_grad or torch.compiler.is_compiling():
-            kept.append(piece)
-            continue
-        if whole is None:
-            whole = piece.new_empty(*piece.shape[:dim], count, *piece.shape[dim + 1 :])
-        whole.narrow(dim, place.start, piece.shape[dim]).copy_(piece)
-    return torch.cat(kept, dim) if whole is None else whole
 
 
 Item = TypeVar("Item")
@@ -139,31 +119,25 @@ def in_parallel(
             return [work(item) for item in items]
     inference = torch.is_inference_mode_enabled()
     waiting = enumerate(items)  # each of the threads takes the next one
-    results: dict[int, Result] = {}
-    errors: dict[int, BaseException] = {}
 
-    def take_part() -> None:
+    def take_part() -> list[tuple[int, Result]]:
         torch.set_num_threads(min(within, allowed // threads))  # of this thread
         with torch.inference_mode(inference), torch.no_grad():
-            for place, item in waiting:
-                try:
-                    results[place] = work(item)
-                except BaseException as error:
-                    errors[place] = error
-                    for _ in waiting:  # no thread begins another item
-                        pass
+            try:
+                return [(place, work(item)) for place, item in waiting]
+            except BaseException:
+                deque(waiting, maxlen=0)  # no thread begins another item
+                raise
 
     try:
         # a new pool each time, because a kept one would not survive a fork; this thread takes part, because the C
         # library keeps the memory that it frees for the next call, but may return that of other threads
         with ThreadPoolExecutor(threads - 1) as pool:
-            for _ in range(threads - 1):
-                pool.submit(take_part)
-            take_part()
+            others = [pool.submit(take_part) for _ in range(threads - 1)]
+            made = take_part()
     finally:
         torch.set_num_threads(within)  # the initial value of threads that are started later
-    if errors:
-        raise errors[min(errors)]
+    results = dict(chain(made, *(other.result() for other in others)))
     return [results[place] for place in range(len(items))]
 
 
@@ -188,10 +162,7 @@ def prefetched(items: Generator[Item, None, None], count: int, threads: int = 1)
     """
     with _pool(1, threads, items) as pool:
         waiting = deque(pool.submit(list, islice(items, 1)) for _ in range(count + 1))
-        while True:
-            made = waiting.popleft().result()
-            if not made:  # there are no further items
-                return
+        while made := waiting.popleft().result():  # empty if there are no further items
             yield made[0]
             waiting.append(pool.submit(list, islice(items, 1)))
 

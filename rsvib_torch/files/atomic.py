@@ -142,62 +142,50 @@ def check_target(path: Path, kind: Kind = "file", *, parent_exists: bool = True)
         raise PermissionError(f"cannot write into folder {path}: it is not writable")
 
 
-def check_writable(path: Path, *, folder: bool = False) -> None:
+def check_writable(path: Path, kind: Kind = "file") -> None:
     """Raise an ``OSError`` with the reason if ``path`` cannot be written; creates nothing."""
-    check_target(path, "folder" if folder else "file")
+    check_target(path, kind)
     with temporary_folder(path):
         pass
 
 
 @contextmanager
-def whole(path: _Path, kind: Kind = "file") -> Iterator[Path]:
+def whole(path: _Path, kind: Kind = "file", *, parent_exists: bool = True) -> Iterator[Path]:
     """Write a file or folder under a temporary name; it gets its name when the block ends without an exception.
 
-    It is on the disk then. The folders above it are created. An existing file is replaced; an existing folder keeps its
-    other files. The block creates what has the temporary name. ``kind`` is as in ``StackFormat``.
+    It is on the disk then. An existing file is replaced; an existing folder keeps its other files. The block creates
+    the file, or writes into the folder, that has the temporary name. ``kind`` is as in ``StackFormat``; the folder of a
+    file must exist if ``parent_exists``, other folders are created.
     """
     target = Path(path)
-    check_target(target, kind, parent_exists=False)
+    check_target(target, kind, parent_exists=parent_exists)
     with temporary_folder(target) as folder:
-        yield folder / target.name
+        part = folder / target.name
+        if kind == "folder":
+            part.mkdir()
+        yield part
         for place, _, names in os.walk(folder, topdown=False):
             for name in (*names, ""):
                 sync(Path(place, name))
         make_folder(target.parent)
         if kind == "folder" and target.is_dir():
-            moves = [(file, target / file.name) for file in sorted((folder / target.name).iterdir())]
+            moves = [(file, target / file.name) for file in sorted(part.iterdir())]
         else:
-            moves = [(folder / target.name, target)]
-        for part, final in moves:
-            check_target(final, "file" if part.is_file() else "folder", parent_exists=False)
-        for part, final in moves:
+            moves = [(part, target)]
+        for made, final in moves:
+            check_target(final, "file" if made.is_file() else "folder", parent_exists=False)
+        for made, final in moves:
             if final.is_file():
-                part.chmod(stat.S_IMODE(final.stat().st_mode))
-            os.replace(part, final)
+                made.chmod(stat.S_IMODE(final.stat().st_mode))
+            os.replace(made, final)
         if kind == "folder":
             sync(target)
         sync(target.absolute().parent)
 
 
-@contextmanager
-def whole_file(path: _Path) -> Iterator[Path]:
-    """``whole`` for a file in a folder that must exist."""
-    check_target(Path(path))
-    with whole(path) as part:
-        yield part
-
-
-@contextmanager
-def whole_folder(path: _Path) -> Iterator[Path]:
-    """``whole`` for a folder, which is created."""
-    with whole(path, "folder") as part:
-        part.mkdir()
-        yield part
-
-
 def write_json(path: _Path, content: Mapping[str, object]) -> None:
     """Write a table as JSON with one key per line, atomically."""
-    with whole_file(path) as part:
+    with whole(path) as part:
         part.write_text(json_text(content) + "\n", encoding="utf-8")
 
 
@@ -205,10 +193,6 @@ def _places(path: _Path) -> set[Path]:
     """Absolute path of a file, with the link followed or not if it is one."""
     path = Path(path).absolute()
     return {Path(os.path.realpath(path)), Path(os.path.realpath(path.parent), path.name)}
-
-
-def _inside(path: _Path, folder: _Path) -> bool:
-    return any(place != above and place.is_relative_to(above) for place in _places(path) for above in _places(folder))
 
 
 def _same_file(path: _Path, other: _Path) -> bool:
@@ -219,9 +203,12 @@ def _same_file(path: _Path, other: _Path) -> bool:
 
 def _relation(path: _Path, other: _Path) -> str:
     """How a file to write is related to one that this would change; empty if it is not."""
-    if _same_file(path, other) or not _places(path).isdisjoint(_places(other)):
+    places, others = _places(path), _places(other)
+    if _same_file(path, other) or not places.isdisjoint(others):
         return "is"
-    return "contains" if _inside(other, path) else "lies inside" if _inside(path, other) else ""
+    if any(not places.isdisjoint(place.parents) for place in others):
+        return "contains"
+    return "lies inside" if any(not others.isdisjoint(place.parents) for place in places) else ""
 
 
 def check_outputs(outputs: Iterable[_Path], inputs: Iterable[_Path], *, folder: _Path | None = None) -> None:
@@ -235,7 +222,7 @@ def check_outputs(outputs: Iterable[_Path], inputs: Iterable[_Path], *, folder: 
         check_not_special(output)
     for source in inputs:
         places = [(f"cannot write {output}", output, "name") for output in outputs]
-        if folder is not None and (os.path.isdir(source) or not _inside(source, folder)):
+        if folder is not None and (os.path.isdir(source) or _relation(folder, source) != "contains"):
             places.insert(0, (f"cannot write into {folder}", folder, "folder"))
         for problem, place, remedy in places:
             relation, member = _relation(place, source), None

@@ -9,14 +9,15 @@ the user gave float64).
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, TypeVar
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import Channels, FramesLike, FramesOrFiles, as_tensor, channel_axis, check_pixels
-from rsvib_torch.checks.values import beyond_full_scale, check_number
+from rsvib_torch.checks.values import check_number
 from rsvib_torch.frames.entry_points import load_frames
+from rsvib_torch.frames.full_scale import scaled_counts
 from rsvib_torch.frames.pixels import (
     are_mosaics,
     check_mosaic,
@@ -33,8 +34,6 @@ from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import MaskedInputOptions
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
-
-Entry = TypeVar("Entry")
 
 
 def frames_to_row_order(frames: Tensor, timing: SensorTiming) -> Tensor:
@@ -73,18 +72,6 @@ def magnitudes_from_row_order(values: Tensor, timing: SensorTiming, axis: int = 
     return values[..., order] if axis == -1 else values[..., order, :]
 
 
-def sequence_from_row_order(values: Sequence[Entry], timing: SensorTiming) -> tuple[Entry, ...]:
-    """Turn one entry for each component, back to image axes.
-
-    Example:
-        >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512, scan_axis="x")
-        >>> sequence_from_row_order(["along the row", "along the scan"], timing)
-        ('along the scan', 'along the row')
-    """
-    order, _ = row_axes(timing, len(values))
-    return tuple(values[axis] for axis in order)
-
-
 def reasons_from_row_order(reasons: Sequence[Reason], timing: SensorTiming) -> tuple[Reason, ...]:
     """Reasons with the names of their axes in the image."""
     order, _ = row_axes(timing, len(AXIS_NAMES))
@@ -96,7 +83,8 @@ def findings_from_row_order(
     findings: Sequence[Sequence[Reason]], timing: SensorTiming
 ) -> tuple[tuple[Reason, ...], ...]:
     """Turn the reasons against each component back to image axes."""
-    return sequence_from_row_order([reasons_from_row_order(reasons, timing) for reasons in findings], timing)
+    order, _ = row_axes(timing, len(findings))
+    return tuple(reasons_from_row_order(findings[axis], timing) for axis in order)
 
 
 Saturation = float | Literal["auto"] | None
@@ -285,24 +273,12 @@ def as_float_frames(
         raise ValueError(f"at least {minimum_frames} frames are needed, got {count}{remedy}")
     if min(frames.shape) == 0:
         raise ValueError(f"{name} must not be empty, got shape {tuple(frames.shape)}")
-    if frames.dtype.is_complex or frames.dtype == torch.bool:
-        remedy = f"; pass {name}.float()" if frames.dtype == torch.bool else ""
-        raise TypeError(f"{name} must be real numbers, got {frames.dtype}{remedy}")
+    if frames.dtype == torch.bool:
+        raise TypeError(f"{name} must be real numbers, got {frames.dtype}; pass {name}.float()")
     if frames.dtype.is_floating_point:
         check_pixels(name, frames)
         return frames if frames.dtype == torch.float64 else frames.to(torch.float32)
-    if full_scale is None:
-        if frames.dtype != torch.uint8:
-            raise ValueError(
-                f"full scale of {str(frames.dtype).removeprefix('torch.')} {name} unknown: pass full_scale, e.g. "
-                "full_scale=4095 for 12-bit counts (commands: --full-scale 4095)"
-            )
-        full_scale = 255.0
-    full_scale = check_number("full_scale", full_scale, above=0.0)
-    counts = frames.to(torch.float32)  # PyTorch finds no largest value of some integers
-    if counts.numel() and (largest := float(counts.max())) > _MOST_COUNTS * full_scale:
-        raise ValueError(f"{name}: {beyond_full_scale(int(largest), full_scale)}")
-    return counts / full_scale
+    return scaled_counts(frames, full_scale, name, most=_MOST_COUNTS)
 
 
 def _missing_pixels(frames: Tensor, ignore: object, allow_missing: bool, axis: int) -> Tensor | None:
@@ -476,7 +452,7 @@ def grey_frames(
         around = torch.nn.functional.avg_pool2d(valid.to(images.dtype), 3, 1, 1)
         valid = _unless_complete(valid | (around > _MEASURED_AROUND))
     # a frame without detail has no displacement
-    for stack, frame in _constant(images).nonzero().tolist():
+    for stack, frame in is_constant(images.amin((2, 3, 4)), images.amax((2, 3, 4))).nonzero().tolist():
         place, remedy = f"{frame}{of_stack(stack)}", "leave out this stack" if prepared.batched else "remove this frame"
         raise ValueError(f"{constant_frame(place)}; {remedy}")
     # a copy of a frame was exposed at another time than its place in the stack states
@@ -504,9 +480,8 @@ def constant_frame(place: int | str) -> str:
     return f"frame {place} is constant and cannot be registered"
 
 
-def _constant(frames: Tensor) -> Tensor:
-    """(B, T) bool, frames (B, T, C, H, W) with equal pixels, to rounding."""
-    low, high = frames.amin((-3, -2, -1)), frames.amax((-3, -2, -1))
+def is_constant(low: Tensor, high: Tensor) -> Tensor:
+    """Whether the pixels between the lowest and the highest one are equal, to rounding."""
     return high - low <= 1e-6 * torch.maximum(low.abs(), high.abs())
 
 

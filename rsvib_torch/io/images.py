@@ -17,8 +17,8 @@ from PIL import ExifTags, Image
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile, putchunk
 
+from rsvib_torch.frames.full_scale import known_full_scale
 from rsvib_torch.io.frame_reader import FrameError, FrameReader, check_held, readable_stack
-from rsvib_torch.io.full_scale import known_full_scale
 from rsvib_torch.io.stack_info import DIFFERENT, StackInfo, Tag, exif_fields
 from rsvib_torch.io.tiff import open_tiff, write_tiff
 from rsvib_torch.numerics.tables import Array
@@ -208,7 +208,6 @@ def write_images(path: Path, info: StackInfo, frames: Iterator[Array], compressi
     if path.suffix:
         _write_file(path, info, next(frames))
         return
-    path.mkdir()
     for name, source, frame in zip(_frame_names(info), info.files or [None] * info.shape[0], frames, strict=True):
         _write_file(path / name, info, frame, source)
 

@@ -13,7 +13,7 @@ from PIL import ExifTags, Image
 
 from rsvib_torch.checks.arguments import channels_appear_last, check_fields, checked_methods
 from rsvib_torch.files.reading import Table
-from rsvib_torch.io.full_scale import check_dtype, known_full_scale
+from rsvib_torch.frames.full_scale import check_dtype, known_full_scale
 from rsvib_torch.results.presentation import Summarised
 from rsvib_torch.text import one_line
 

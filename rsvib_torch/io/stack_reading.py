@@ -5,6 +5,7 @@ import os
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +16,11 @@ from rsvib_torch.checks.arguments import PathLike, checks_arguments
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.files.reading import check_fits
 from rsvib_torch.frames.entry_points import LoadedFrames
+from rsvib_torch.frames.full_scale import counts_to_frames, required_full_scale
 from rsvib_torch.io.formats import find_format
 from rsvib_torch.io.frame_reader import FrameReader, part_reader
 from rsvib_torch.io.frame_times import timing_from_first_frame
-from rsvib_torch.io.full_scale import counts_to_frames, full_scale_of_counts
 from rsvib_torch.io.stack_info import StackInfo, split_range
-from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array
 
 _FRAME_COPIES = 24  # bytes per pixel of one frame while it is decoded and converted
@@ -159,10 +159,7 @@ def read_frames(path: PathLike, indices: Sequence[int], full_scale: float | None
 def load_files(paths: Sequence[PathLike], full_scale: float | None) -> LoadedFrames:
     """Frames of files as the argument ``frames`` of a function, with the times of the first file."""
     pixels, full_scale, first = _read_pixels(paths, full_scale, as_counts=True)
-
-    def timed(timing: SensorTiming) -> SensorTiming:
-        return timing_from_first_frame(timing, first)
-
+    timed = partial(timing_from_first_frame, info=first)
     if pixels.dtype.kind == "f":
         return LoadedFrames(torch.from_numpy(pixels), None, timed)
-    return LoadedFrames(pixels, full_scale_of_counts(pixels, full_scale, str(paths[0])), timed)
+    return LoadedFrames(pixels, required_full_scale(full_scale, pixels.dtype, paths[0]), timed)

@@ -10,9 +10,9 @@ import torch
 from rsvib_torch.checks.arguments import Channels, FramesLike, PathLike, as_tensor, channel_axis, checks_arguments
 from rsvib_torch.checks.values import check_choice
 from rsvib_torch.execution.progress import steps
-from rsvib_torch.files.atomic import check_outputs, check_target, check_writable, whole
+from rsvib_torch.files.atomic import check_outputs, check_target, whole
+from rsvib_torch.frames.full_scale import check_dtype, frames_to_counts, known_full_scale, required_full_scale
 from rsvib_torch.io.formats import FORMATS, StackFormat, target_format
-from rsvib_torch.io.full_scale import check_dtype, frames_to_counts, known_full_scale, required_full_scale
 from rsvib_torch.io.stack_info import DIFFERENT, StackInfo, split_range
 from rsvib_torch.numerics.tables import Array
 
@@ -23,11 +23,11 @@ def stack_files(path: PathLike) -> list[Path]:
 
 
 def check_info_target(
-    path: Path, info: StackInfo, compression: str | None = None, *, check_folder: bool = True
+    path: Path, info: StackInfo, compression: str | None = None, *, parent_exists: bool = True
 ) -> StackFormat:
-    """The format in which ``path`` is written, or the error of writing; ``check_folder``: its folder must exist."""
+    """The format in which ``path`` is written, or the error of writing; ``parent_exists`` as in ``check_target``."""
     form = target_format(path)
-    check_target(path, form.kind, parent_exists=False)
+    check_target(path, form.kind, parent_exists=parent_exists)
     if info.dtype not in form.dtypes:
         raise ValueError(f"{path}: {form.name} files hold {', '.join(form.dtypes)}; got dtype {info.dtype}")
     if compression is not None:
@@ -38,8 +38,6 @@ def check_info_target(
         form.check(path, info)
     if info.is_integer:
         required_full_scale(info.full_scale, np.dtype(info.dtype), path)
-    if check_folder:
-        check_writable(path, folder=form.kind == "folder")
     return form
 
 
@@ -90,7 +88,7 @@ def write_frames(
 ) -> None:
     """Write a stack from its frames as stored; it gets its name when it is complete and on the disk."""
     assert form.write is not None
-    with whole(path, form.kind) as part:
+    with whole(path, form.kind, parent_exists=False) as part:
         form.write(part, info, frames, compression)
 
 
@@ -156,7 +154,7 @@ def write_stack(
     if not frames.dtype.is_floating_point:
         stored = np.dtype(str(frames.dtype).removeprefix("torch."))
         check_dtype(stored)
-        full_scale = required_full_scale(known_full_scale(stored, full_scale), stored, "frames")
+        full_scale = required_full_scale(full_scale, stored, "frames")
         dtype = dtype or stored.name
         frames = frames.to(torch.float64) / full_scale  # exact for integers of 32 bits
     axis = channel_axis("frames", frames.shape, channels)

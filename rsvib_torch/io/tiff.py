@@ -17,8 +17,8 @@ import numpy as np
 import tifffile
 
 from rsvib_torch.files.reading import Table
+from rsvib_torch.frames.full_scale import check_dtype
 from rsvib_torch.io.frame_reader import FrameError, FrameReader, check_held, contiguous_reader, readable_stack
-from rsvib_torch.io.full_scale import check_dtype
 from rsvib_torch.io.stack_info import Scope, StackInfo, Tag, attributes_of, fields_of_attributes
 from rsvib_torch.numerics.tables import Array
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import fft, special
 from torch import Tensor
 
-from rsvib_torch.execution.parallel import gathered, runs
+from rsvib_torch.execution.parallel import runs
 from rsvib_torch.numerics.tables import Array, table, tensor
 
 
@@ -114,8 +114,8 @@ def mirrored(index: Tensor, length: int) -> Tensor:
     return torch.minimum(index, period - index)
 
 
-def bspline_coefficient_rows(samples: Tensor, degree: int) -> Iterator[tuple[slice, Tensor]]:
-    """``bspline_coefficients`` across the rows of images, in slices of rows that stay in the cache."""
+def bspline_coefficient_rows(samples: Tensor, degree: int) -> Iterator[Tensor]:
+    """``bspline_coefficients`` across the rows of images: those of consecutive rows, which stay in the cache."""
     on_cpu, height = samples.device.type == "cpu", samples.shape[-2]
     fits = samples.numel() <= (1 << 20 if on_cpu else 1 << 24)  # the cache, or the memory
     kernel = _prefilter(degree, samples)
@@ -123,7 +123,7 @@ def bspline_coefficient_rows(samples: Tensor, degree: int) -> Iterator[tuple[sli
     index = mirrored(torch.arange(-reach, height + reach, device=samples.device), height)
     for rows in runs(height, height if fits else 64 if on_cpu else 256):
         near = samples.index_select(-2, index[rows.start : rows.stop + 2 * reach])
-        yield rows, correlated(near, kernel, -2)[0]
+        yield correlated(near, kernel, -2)[0]
 
 
 def bspline_coefficients(samples: Tensor, degree: int, dim: int) -> Tensor:
@@ -266,11 +266,8 @@ def extended_length(width: int, reach: int) -> int:
 
 def spline_spectra(images: Tensor, degree: int, length: int) -> Tensor:
     """Transforms (..., H, U) along rows, extended to ``length``, of spline coefficients across images (..., H, W)."""
-    pieces = (
-        (rows, torch.fft.rfft(extend_rows(coefficients, length)))
-        for rows, coefficients in bspline_coefficient_rows(images, degree)
-    )
-    return gathered(pieces, images.shape[-2], images.ndim - 2)
+    rows = bspline_coefficient_rows(images, degree)
+    return torch.cat([torch.fft.rfft(extend_rows(coefficients, length)) for coefficients in rows], dim=-2)
 
 
 def shift_phases(shift: Tensor, length: int, frequencies: slice, dtype: torch.dtype) -> Tensor:

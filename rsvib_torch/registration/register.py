@@ -21,7 +21,7 @@ from rsvib_torch.execution.parallel import at_once, chunks, runs
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.entry_points import frames_options
 from rsvib_torch.frames.pixels import smoothed
-from rsvib_torch.frames.prepare import offsets_from_row_order, prepare_frames, sequence_from_row_order
+from rsvib_torch.frames.prepare import offsets_from_row_order, prepare_frames
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.numerics.interpolation import fast_length
 from rsvib_torch.options import BandRegistrationOptions, RegistrationOptions
@@ -142,8 +142,7 @@ def register_bands(frames: FramesOrFiles, timing: SensorTiming, options: BandReg
     )
     batch = register_rows(prepared.images.mean(2), prepared.timing, bands)
     curve = batch if prepared.batched else batch[0]
-    height_x, height_y = sequence_from_row_order(curve.heights, timing)
-    return replace(curve, offsets=offsets_from_row_order(curve.offsets, timing), heights=(height_x, height_y))
+    return replace(curve, offsets=offsets_from_row_order(curve.offsets, timing))
 
 
 def similar_share(curve: OffsetCurve, columns: int) -> Tensor:

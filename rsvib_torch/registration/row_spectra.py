@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.execution.parallel import at_once, chunks, gathered, runs
+from rsvib_torch.execution.parallel import at_once, chunks, runs
 from rsvib_torch.numerics.interpolation import (
     bspline_coefficient_rows,
     bspline_weights,
@@ -48,14 +48,14 @@ class RowSpectra:
         )
 
         def transformed(part: slice) -> Tensor:
-            rows_of_frames = (
-                (rows, extend_rows(coefficients.sub_(level[:, part]).div_(contrast[:, part]), self.length, hold=0.0))
-                for rows, coefficients in bspline_coefficient_rows(frames[:, part], DEGREE)
+            rows = (
+                extend_rows(coefficients.sub_(level[:, part]).div_(contrast[:, part]), self.length, hold=0.0)
+                for coefficients in bspline_coefficient_rows(frames[:, part], DEGREE)
             )
-            return gathered(((rows, torch.fft.rfft(values)) for rows, values in rows_of_frames), self.height, 2)
+            return torch.cat([torch.fft.rfft(values) for values in rows], dim=2)
 
         parts = runs(frames.shape[1], at_once(bytes_of_frame, frames.device, cpu_bytes=2**26))
-        self.values = gathered(((part, transformed(part)) for part in parts), frames.shape[1], 1)
+        self.values = torch.cat([transformed(part) for part in parts], dim=1)
         self._index_rows()
         self.frequencies = torch.fft.rfftfreq(self.length, dtype=torch.float64, device=frames.device)
         self._band = slice(0, len(self.frequencies))

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from rsvib_torch.detection import DetectionResult
-from rsvib_torch.files.atomic import whole_file
+from rsvib_torch.files.atomic import whole
 from rsvib_torch.files.reading import Table
 from rsvib_torch.frames.pixels import enlarged
 from rsvib_torch.motion.timing import SensorTiming
@@ -224,7 +224,7 @@ def write_report_page(folder: Path, report: Report) -> list[str]:
         camera=_camera(timing),
         created=datetime.now().astimezone().isoformat(" ", "seconds"),
     )
-    with whole_file(folder / "report.html") as part:
+    with whole(folder / "report.html") as part:
         part.write_text(text, encoding="utf-8")
     for name, _, png in figures:
         (folder / f"{name}.png").write_bytes(png)

@@ -23,7 +23,7 @@ from rsvib_torch.checks.values import Count, check_single
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.detection.spectrum import SMALLEST_SHOWN
 from rsvib_torch.evaluation import MtfCurve
-from rsvib_torch.files.atomic import whole_file
+from rsvib_torch.files.atomic import whole
 from rsvib_torch.files.reading import Table
 from rsvib_torch.imaging import row_psf
 from rsvib_torch.imaging.trajectory import exposure_nodes
@@ -69,7 +69,7 @@ def save_figure(
         path: The file to write; its ending selects the format (``.png``, ``.svg``, ``.pdf``).
         dpi: Pixels per inch.
     """
-    with whole_file(path) as part:
+    with whole(path) as part:
         figure.savefig(part, dpi=dpi, facecolor="white")
 
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.values import check_single
 from rsvib_torch.detection import DetectionResult, MotionDetection
-from rsvib_torch.files.atomic import whole_file
+from rsvib_torch.files.atomic import whole
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.results.presentation import Result, plain_values
 
@@ -85,7 +85,7 @@ def write_offsets(path: str | os.PathLike[str], result: DetectionResult) -> None
 
 def write_columns(path: str | os.PathLike[str], columns: Mapping[str, Iterable[object]]) -> None:
     """Write columns of one length by name as CSV; None becomes an empty cell."""
-    with whole_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+    with whole(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(columns)
         writer.writerows(zip(*columns.values(), strict=True))

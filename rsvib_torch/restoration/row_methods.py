@@ -12,7 +12,7 @@ from torch.nn.functional import embedding_bag
 
 from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.values import check_single, check_whole_number, described
-from rsvib_torch.execution.parallel import at_once, gathered, runs
+from rsvib_torch.execution.parallel import at_once, runs
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.prepare import frames_from_row_order, frames_to_row_order
 from rsvib_torch.imaging.blur import RowPSF, RowVaryingBlur, trajectory_psf
@@ -56,8 +56,8 @@ def restore_dewarp(given: MovingFrames, options: DewarpOptions = DewarpOptions()
         rows = _moved_back(spectra, taps[:, part], weights[:, part], torch.view_as_real(phases))
         return torch.fft.irfft(torch.view_as_complex(rows), n=length)[..., :W]
 
-    parts = ((part, restored(part)) for part in runs(H, _CHUNK_ROWS))
-    return gathered(parts, H, 1).unflatten(0, (B, T)).movedim(3, 2)
+    parts = [restored(part) for part in runs(H, _CHUNK_ROWS)]
+    return torch.cat(parts, dim=1).unflatten(0, (B, T)).movedim(3, 2)
 
 
 def _found_rows(motion: FrameMotion, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:

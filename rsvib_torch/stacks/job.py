@@ -12,9 +12,9 @@ from torch import Tensor
 
 from rsvib_torch.checks.arguments import PathLike
 from rsvib_torch.checks.values import check_choice
+from rsvib_torch.frames import full_scale as scales
 from rsvib_torch.frames.pixels import check_mosaic, colour_frames, enlarged
 from rsvib_torch.frames.prepare import largest_count
-from rsvib_torch.io import full_scale as scales
 from rsvib_torch.io.frame_reader import FrameError, FrameReader
 from rsvib_torch.io.frame_times import exposure_times, timing_of_stack
 from rsvib_torch.io.stack_info import StackInfo
@@ -33,13 +33,13 @@ from rsvib_torch.options import (
 from rsvib_torch.restoration.restore import check_optics
 from rsvib_torch.stacks.memory import windows_at_once
 from rsvib_torch.stacks.window_restoration import (
-    frame_fault,
     known_motion,
     measured_motion,
     restore_trusted,
+    usable_frame,
     without_data,
 )
-from rsvib_torch.stacks.windows import StoredWindow, Window, WindowRecord, WindowResult, cut_windows, window_timing
+from rsvib_torch.stacks.windows import Window, WindowRecord, WindowResult, cut_windows, window_timing
 
 WindowFrames = list[Array | str]  # pixels as stored, or why a frame cannot be read
 
@@ -83,17 +83,20 @@ class StackJob:
     def compute(self, window: Window, pixels: WindowFrames) -> WindowResult:
         """Detect the vibration in a window, restore its frames and judge the result."""
         # 1. The frames that can be used.
-        options, read = self.options, dict(zip(window.frames, pixels, strict=True))
-        found = ((index, frame_fault(read[index], index, options.full_scale, self.info.nodata)) for index in read)
-        faults = {index: fault for index, fault in found if fault is not None}
-        usable = {index: one for index, one in read.items() if index not in faults and not isinstance(one, str)}
-        kept = tuple(index for index in usable if index in window.written)
-        taken = self._images(list(usable.values()))
+        options, images, faults = self.options, dict[int, Tensor](), dict[int, str]()
+        for index, stored in zip(window.frames, pixels, strict=True):
+            try:
+                images[index] = usable_frame(stored, index, options.full_scale, self.info.nodata)
+            except ValueError as error:
+                faults[index] = str(error)
+        kept = tuple(index for index in images if index in window.written)
+        none = torch.empty((0, *self.info.shape[1:]), dtype=torch.float32, device="cpu")
+        taken = (torch.stack(list(images.values())) if images else none).to(options.device)
         bad = {index: fault for index, fault in faults.items() if index in window.written}
         result = WindowResult(window, kept, self._unchanged(taken[: len(kept)]), None, None, None, bad)
-        if faults and len(usable) < 2:
+        if faults and len(images) < 2:
             return replace(result, error=next(iter(faults.values())))
-        timing = window_timing(self.timing, window, list(usable))
+        timing = window_timing(self.timing, window, list(images))
         try:
             # 2. Their motion.
             if self.given is None:
@@ -130,10 +133,10 @@ class StackJob:
             taken, frames = taken[: len(kept)], frames[: len(kept)]
         return replace(result, frames=frames if self.info.nodata is None else without_data(frames, taken))
 
-    def compute_stored(self, window: Window, pixels: WindowFrames) -> StoredWindow:
-        """``compute``, and the frames as they are stored: those that were not restored are unchanged.
+    def compute_stored(self, window: Window, pixels: WindowFrames) -> tuple[WindowRecord, Array, WindowResult | None]:
+        """The record of a window, its frames as the file has them, and the result of the first window of the stack.
 
-        A frame that cannot be read is stored as NaN, or 0 for integers.
+        Frames that were not restored are unchanged. One that cannot be read is stored as NaN, or 0 for integers.
         """
         result, dtype = self.compute(window, pixels), np.dtype(self.info.dtype)
 
@@ -146,7 +149,8 @@ class StackJob:
                 frame = np.full(self.info.shape[1:], np.nan if dtype.kind == "f" else 0, dtype)
             if self.chosen.scale == 1 and self.chosen.mosaic is None:
                 return frame
-            return counts(self._unchanged(self._as_taken(frame[None]))[0])  # the shape of restored ones
+            taken = scales.counts_to_frames(frame[None], self.options.full_scale, str(self.source), self.info.nodata)
+            return counts(self._unchanged(taken)[0])  # the shape of restored ones
 
         if result.restored and self.is_joined:
             frames = list(counts(result.frames))
@@ -156,7 +160,7 @@ class StackJob:
             written = [middle] if self.is_joined else window.written
             frames = [counts(restored[index]) if index in restored else as_taken(index) for index in written]
         record, first = WindowRecord.of(result, self.timing, len(frames)), result if window.index == 0 else None
-        return StoredWindow(record, np.ascontiguousarray(np.stack(frames)), first)  # channels may be stored last
+        return record, np.ascontiguousarray(np.stack(frames)), first  # channels may be stored last
 
     def _unchanged(self, frames: Tensor) -> Tensor:
         """Frames that were not restored, in the shape of restored ones."""
@@ -164,21 +168,12 @@ class StackJob:
         return enlarged(frames if mosaic is None else colour_frames(frames, mosaic), self.chosen.scale)
 
     def _for_counts(self, frames: Tensor) -> RestorationOptions:
-        """The options of ``restore``: with the largest count of fewer bits in place of full scale."""
+        """The options of ``restore``, with the level at which the counts of the file are saturated by themselves."""
         full_scale = self.options.full_scale
-        if self.chosen.saturation != 1.0 or full_scale is None:
+        if self.chosen.saturation != "auto" or full_scale is None:
             return self.chosen
         counts = (frames * full_scale).round().nan_to_num(0.0).to(torch.int64)
         return replace(self.chosen, saturation=largest_count(counts, full_scale) / full_scale)
-
-    def _images(self, frames: Sequence[Array]) -> Tensor:
-        """Frames as stored as (T, H, W) or (T, C, H, W), full scale 1."""
-        if not frames:
-            return torch.empty((0, *self.info.shape[1:]), dtype=torch.float32, device="cpu")
-        return self._as_taken(np.stack(frames)).to(self.options.device)
-
-    def _as_taken(self, stored: Array) -> Tensor:
-        return scales.counts_to_frames(stored, self.options.full_scale, str(self.source), self.info.nodata)
 
 
 def stored_frame(read: Callable[[int], Array], index: int) -> Array | str:
@@ -254,7 +249,4 @@ def plan_job(
     joint, most = job.chosen.joint, min(stated.window, info.shape[0])
     if joint is not True and joint > most:
         raise ValueError(f"joint must be at most {most}, the number of frames of a window, got {joint}")
-    at_once = windows_at_once(
-        info, stated.window, restoration, memory=options.memory, workers=options.workers, on_gpu=device != "cpu"
-    )
-    return job, windows, at_once
+    return job, windows, windows_at_once(info, stated)

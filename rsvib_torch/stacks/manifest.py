@@ -99,10 +99,8 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
             lines += [{**first, **tone, **last} for tone in tones]
         return joined_columns(lines)
 
-    def _middle_times(self) -> list[float | None]:
-        """Middle of the frames of every window in s; None if the sensor is not known."""
-        if self.settings.get("sensor") is None:
-            return [None] * len(self.windows)
+    def _middle_times(self) -> list[float]:
+        """Middle of the frames of every window in s."""
         half_frame = self.timing.time_to_middle(self.input["shape"][self.timing.scan_axis])
         starts = self.timing.frame_starts(self.windows[-1].last + 1).tolist()
         return [0.5 * (starts[record.first] + starts[record.last]) + half_frame for record in self.windows]

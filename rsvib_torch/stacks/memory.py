@@ -11,7 +11,7 @@ import psutil
 
 from rsvib_torch.files.reading import check_fits, free_memory, size_text
 from rsvib_torch.io.stack_info import StackInfo
-from rsvib_torch.options import OptionTable
+from rsvib_torch.options import OptionTable, ProcessStackOptions
 from rsvib_torch.restoration.priors import PRIORS
 from rsvib_torch.text import quoted
 
@@ -35,27 +35,25 @@ def share_one_heap() -> None:
         ctypes.CDLL(None).mallopt(arena_max, 1)
 
 
-def parse_memory(text: str | float) -> int:
-    """Number of bytes of a text like ``"2GB"``, ``"500 MB"`` or ``"1.5GiB"``."""
-    match = re.fullmatch(r"\s*([0-9]+(?:\.[0-9]+)?)\s*(?:([KMGT])(I?))?B?\s*", str(text).upper())
+def memory_limit(memory: str | float | None) -> int:
+    """Limit for the memory of the process in bytes: of a text like ``"2GB"``, ``"500 MB"`` or ``"1.5GiB"``.
+
+    Without one, it is three quarters of what the process has and can get.
+    """
+    if memory is None:
+        return int(0.75 * (psutil.Process().memory_info().rss + free_memory()))
+    match = re.fullmatch(r"\s*([0-9]+(?:\.[0-9]+)?)\s*(?:([KMGT])(I?))?B?\s*", str(memory).upper())
     number, prefix, binary = ("0", None, None) if match is None else match.groups()
     size = int(float(number) * (1024 if binary else 1000) ** (" KMGT".index(prefix or " ")))
     if size <= 0:
-        raise ValueError(f"memory must be like '2GB' or '500MB', got {quoted(text)}")
+        raise ValueError(f"memory must be like '2GB' or '500MB', got {quoted(memory)}")
     return size
-
-
-def memory_limit(memory: str | float | None) -> int:
-    """Limit for the memory of the process in bytes: as stated, else three quarters of what it has and can get."""
-    if memory is not None:
-        return parse_memory(memory)
-    return int(0.75 * (psutil.Process().memory_info().rss + free_memory()))
 
 
 def memory_needed(
     info: StackInfo, window: int, restoration: OptionTable, count: int = 1, *, on_gpu: bool = False
 ) -> int:
-    """Memory of the process in bytes while ``count`` windows are processed; arguments as in ``windows_at_once``."""
+    """Memory of the process in bytes while ``count`` windows are processed; without ``restoration`` detection only."""
     if on_gpu:
         pixel_bytes = 8  # frames and result as float32; the rest is in the memory of the GPU
     elif restoration is None:
@@ -74,25 +72,18 @@ def memory_needed(
     return once + count * (_WINDOW_BYTES + pixels * pixel_bytes + queued + more)
 
 
-def windows_at_once(
-    info: StackInfo,
-    window: int,
-    restoration: OptionTable,
-    *,
-    memory: str | float | None = None,
-    workers: int | None = None,
-    on_gpu: bool = False,
-) -> int:
+def windows_at_once(info: StackInfo, options: ProcessStackOptions) -> int:
     """Number of windows that can be processed at once within the memory of the machine.
 
     It is at most ``workers``: by default the number of processors, or 1 on a GPU. The error about too little memory
     states the required size and the largest window that fits.
     """
+    window, memory, workers, on_gpu = options.window, options.memory, options.workers, options.device != "cpu"
     if workers is None:
         processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         workers = 1 if on_gpu else processors
     limit = memory_limit(memory)
-    needed = partial(memory_needed, info, restoration=restoration, on_gpu=on_gpu)
+    needed = partial(memory_needed, info, restoration=options.restoration, on_gpu=on_gpu)
     process, one = needed(window, count=0), needed(window)
     count = (limit - process) // (one - process)
     if count < 1:

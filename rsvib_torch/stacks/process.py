@@ -134,7 +134,7 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
     job, windows, at_once = plan_job(source, timing, options)
     out = job.info.with_frames(len(windows) if job.is_joined else job.info.shape[0])
     out = job.content(out.restored_as(job.chosen.scale, job.chosen.mosaic), timing)
-    form = check_info_target(sink, out, compression, check_folder=False)
+    form = check_info_target(sink, out, compression, parent_exists=False)
     run = FileRun(sink, options, manifest_header(job, sink.name, compression), stack_files(source))
     # 2. A complete output is not computed again.
     finished = run.finished()
@@ -151,13 +151,13 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
         first: WindowResult | None = None
         count = _counter(options.progress, windows, missing)
         with closing(_in_threads(job, job.compute_stored, missing, at_once)) as results:
-            for window, made in zip(missing, results, strict=True):
-                records.append(made.record)
-                first = first or made.result
+            for window, (record, frames, result) in zip(missing, results, strict=True):
+                records.append(record)
+                first = first or result
                 if _all_failed(records, len(windows)):
                     folder.remove()
                     raise ValueError(records[0].error)
-                folder.add(made.record, array=made.frames)
+                folder.add(record, frames)
                 count(window.kept)
         # 4. The output from the windows in the folder, and the manifest.
         with run.writing(folder, not_kept=metadata_not_kept(job.info, sink, out.shape)) as manifest:

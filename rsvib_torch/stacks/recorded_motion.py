@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from rsvib_torch.frames.full_scale import counts_to_frames
 from rsvib_torch.gyroscope.corner_tracks import corner_tracks
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
 from rsvib_torch.gyroscope.rotation_alignment import AlignOptions, RotationAlignment, align_rates
 from rsvib_torch.io.frame_times import timing_from_first_frame
-from rsvib_torch.io.full_scale import counts_to_frames
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.io.stack_reading import open_stack
 from rsvib_torch.motion.camera import Camera

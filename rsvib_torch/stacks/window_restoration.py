@@ -9,14 +9,14 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks.values import MAX_NUMBER, beyond_full_scale
+from rsvib_torch.checks.arguments import check_pixels
 from rsvib_torch.detection import MotionDetection, detect_motion, detect_vibration
 from rsvib_torch.detection.shapes.free import vibration_in_place_of
-from rsvib_torch.frames.prepare import constant_frame, prepare_frames
+from rsvib_torch.frames.full_scale import counts_to_frames
+from rsvib_torch.frames.prepare import constant_frame, is_constant, prepare_frames
 from rsvib_torch.imaging.sensor_model import sharpened
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
@@ -35,26 +35,19 @@ from rsvib_torch.results.reason import Reason
 # --- Frames ---
 
 
-def frame_fault(frame: Array | str, index: int, full_scale: float | None, nodata: float | None) -> str | None:
-    """Why a frame as stored, or the error of reading it, cannot be used; None if it can be."""
-    if isinstance(frame, str):
-        return frame
-    is_float = frame.dtype.kind == "f"
-    valued = frame if nodata is None else frame[frame != frame.dtype.type(nodata)]
-    valid = (valued.size - (int(np.isnan(valued).sum()) if is_float else 0)) / frame.size
+def usable_frame(stored: Array | str, index: int, full_scale: float | None, nodata: float | None) -> Tensor:
+    """Pixels of a stored frame with full scale 1; the ``ValueError`` states why it cannot be used, or was not read."""
+    if isinstance(stored, str):
+        raise ValueError(stored)
+    frame = counts_to_frames(stored, full_scale, f"frame {index}", nodata)
+    missing = torch.isnan(frame)
+    valid = 1.0 - float(missing.double().mean())
     if valid < 0.1:
-        return f"frame {index} has only {valid:.1%} of pixels that count"
-    if is_float and len(infinite := np.argwhere(np.isinf(frame))):
-        place = tuple(int(i) for i in infinite[0])
-        return f"frames must be finite, but pixel {(index, *place)} is {float(frame[place])}"
-    low, high = float(np.nanmin(valued)), float(np.nanmax(valued))
-    if not is_float and full_scale is not None and high > full_scale:
-        return f"{beyond_full_scale(round(high), full_scale)} (frame {index})"
-    largest = max(abs(high), abs(low))
-    if largest > MAX_NUMBER:
-        return f"frame {index} reaches {largest:.3g}, at most {MAX_NUMBER:g} is possible"
-    rounding = 1e-7  # of float32, relative
-    return constant_frame(index) if high - low <= rounding * largest else None
+        raise ValueError(f"frame {index} has only {valid:.1%} of pixels that count")
+    check_pixels(f"pixels of frame {index}", frame.masked_fill(missing, 0.0))
+    if is_constant(*frame[~missing].aminmax()):
+        raise ValueError(constant_frame(index))
+    return frame
 
 
 # --- Motion ---
@@ -192,8 +185,8 @@ class RestoredFrames:
     frames: Tensor  # to write: restored, or as taken
     restored: bool  # whether they are restored
     left_alone: tuple[Reason, ...]  # a reason for each axis that was not restored
-    verdict: RestorationVerdict | None  # whether restoration helps; None if frames could not be compared
-    moves: bool  # whether there was a vibration to remove
+    # whether restoration helps; None if nothing moves, or frames could not be compared, which are restored then
+    verdict: RestorationVerdict | None
     axes: int = 2  # number of components of the motion: 2, 3 with roll, 4 with roll and zoom
     lost_rows: Mapping[int, int] = field(default_factory=dict)  # number for each of the frames that has some
 
@@ -230,7 +223,7 @@ def restore_trusted(
     lost = prepared.lost_rows()
     if not bool(vibration.moving_axes().any()):
         as_taken = unchanged_frames(prepared, joint, scale)
-        return RestoredFrames(as_taken, False, left_alone, None, False, lost_rows=lost)
+        return RestoredFrames(as_taken, False, left_alone, None, lost_rows=lost)
     warn_of_mosaic(prepared)
     restored = restore_prepared(prepared, vibration, options)
     verdict = None
@@ -241,7 +234,7 @@ def restore_trusted(
     if keep:
         restored = sharpened(restored, optics, scale)
     result = prepared.from_row_order(restored) if keep else unchanged_frames(prepared, joint, scale)
-    return RestoredFrames(result, keep, left_alone, verdict, True, vibration.num_axes, lost)
+    return RestoredFrames(result, keep, left_alone, verdict, vibration.num_axes, lost)
 
 
 def without_data(frames: Tensor, taken: Tensor) -> Tensor:

@@ -12,7 +12,6 @@ from rsvib_torch.checks.values import check_whole_number
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.numerics.tables import Array
 from rsvib_torch.results.presentation import Summarised, plain_values
 from rsvib_torch.results.reason import Reason
 from rsvib_torch.stacks.window_restoration import RestoredFrames
@@ -153,12 +152,3 @@ class WindowRecord:
             lost_before=result.lost_before,
             lost_rows={str(index): lost[place] for place, index in enumerate(usable) if place in lost},
         )
-
-
-@dataclass(frozen=True, eq=False)
-class StoredWindow:
-    """A window as it is stored on the disk."""
-
-    record: WindowRecord
-    frames: Array  # those that are written, as the file has them
-    result: WindowResult | None  # of the first window of the stack, for the summary of the run

@@ -12,7 +12,7 @@ import torch
 from rsvib_torch.checks.arguments import PathLike
 from rsvib_torch.checks.values import fields_of
 from rsvib_torch.execution.parallel import in_threads
-from rsvib_torch.files.atomic import whole_file
+from rsvib_torch.files.atomic import whole
 from rsvib_torch.frames.entry_points import file_options
 from rsvib_torch.gyroscope.gpmf_track import read_camera_track
 from rsvib_torch.gyroscope.read_gyroscope import read_gyroscope
@@ -105,7 +105,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         raise ValueError(f"{sink}: videos are written to {', '.join(CONTAINERS)}")
     content = job.content(job.info, timing)
     if border != "crop":
-        check_info_target(sink, content, check_folder=False)
+        check_info_target(sink, content, parent_exists=False)
     header = manifest_header(job, sink.name, None)
     header["settings"] |= {
         "window": None,  # for the commands that read manifests: parts are not windows of their own
@@ -140,7 +140,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         if margins is not None:
             kept = margins.cut(torch.empty(content.shape[-2:], device="meta")).shape
             content = replace(content, shape=(*content.shape[:-2], *kept))
-        check_info_target(sink, content, check_folder=False)
+        check_info_target(sink, content, parent_exists=False)
         _SecondPass(motion, folder, content, margins, progress).run(at_once)
         parts = range(-(-len(frames.starts) // PART_FRAMES))
         _check_shaking(folder, is_explained=any(map(motion.is_explained, parts)))
@@ -149,7 +149,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
             gyroscope = {name: plain_values(getattr(motion.path, name)) for name in _OF_GYROSCOPE}
         not_kept = metadata_not_kept(job.info, sink, content.shape)
         stated = {"margins": margins and asdict(margins), "gyroscope": gyroscope, "not_kept": not_kept}
-        with run.writing(folder, **stated) as manifest, whole_file(sink) as part:
+        with run.writing(folder, **stated) as manifest, whole(sink) as part:
             join_parts(part, content, map(folder.open, folder.files()))
     return run.report(manifest, resumed)
 
@@ -261,7 +261,7 @@ class _SecondPass:
             if shown is None:
                 for _ in part.tracks:
                     write(layout.frame(_cut(layout.black(), self.margins)))
-        folder.add(self.motion.record(part), [name])
+        folder.add(self.motion.record(part), name)
         self.progress()
 
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.execution.parallel import prefetched
-from rsvib_torch.io.full_scale import frames_to_counts
+from rsvib_torch.frames.full_scale import frames_to_counts
 from rsvib_torch.tracking import TrackedFrame, VibrationTracker
 from rsvib_torch.video.frame_outputs import FrameOutput
 from rsvib_torch.video.sources import FrameReader, FrameSource

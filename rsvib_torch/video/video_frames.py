@@ -18,9 +18,9 @@ from torch import Tensor
 from torch.nn.functional import conv1d, embedding_bag
 
 from rsvib_torch.execution.parallel import chunks, prefetched
+from rsvib_torch.frames.full_scale import counts_to_frames, frames_to_counts
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.imaging.trajectory import places, recorded_offsets
-from rsvib_torch.io.full_scale import counts_to_frames, frames_to_counts
 from rsvib_torch.io.video import Picture, VideoReader
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming

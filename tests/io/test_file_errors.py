@@ -10,7 +10,7 @@ import tifffile
 import torch
 from refusals import refuses
 
-from rsvib_torch.files.atomic import whole_file, whole_folder
+from rsvib_torch.files.atomic import whole
 from rsvib_torch.io import read_stack, read_stack_info, write_stack
 
 FRAMES = torch.rand(3, 9, 7, generator=torch.Generator().manual_seed(1))
@@ -112,17 +112,20 @@ def test_png_folder_with_other_frames_is_not_written(tmp_path):
 
 def test_failure_while_writing_leaves_the_old_file_and_nothing_else(tmp_path):
     (tmp_path / "a.txt").write_text("old")
-    with pytest.raises(ZeroDivisionError), whole_file(tmp_path / "a.txt") as part:
+    with pytest.raises(ZeroDivisionError), whole(tmp_path / "a.txt") as part:
         part.write_text("half" * (1 // part.write_text("")))
-    with pytest.raises(ZeroDivisionError), whole_folder(tmp_path / "new" / "deep") as folder:
+    with pytest.raises(ZeroDivisionError), whole(tmp_path / "new" / "deep", "folder") as folder:
         (folder / "b.txt").write_text("half" * (1 // (folder / "a.txt").write_text("")))
     assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
     assert (tmp_path / "a.txt").read_text() == "old"
     (tmp_path / "taken" / "z.txt").mkdir(parents=True)
-    with pytest.raises(IsADirectoryError, match=r"z\.txt: it is a folder"), whole_folder(tmp_path / "taken") as folder:
+    with (
+        pytest.raises(IsADirectoryError, match=r"z\.txt: it is a folder"),
+        whole(tmp_path / "taken", "folder") as folder,
+    ):
         (folder / "b.txt").write_text((folder / "z.txt").write_text("half") * "x")
     assert [p.name for p in (tmp_path / "taken").iterdir()] == ["z.txt"]
-    with whole_folder(tmp_path / "new" / "deep") as folder:
+    with whole(tmp_path / "new" / "deep", "folder") as folder:
         (folder / "b.txt").write_text("whole")
     assert (tmp_path / "new" / "deep" / "b.txt").read_text() == "whole"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.txt", "new", "taken"]
@@ -136,9 +139,9 @@ def test_temporary_folders_of_killed_processes_are_removed_unless_in_use(tmp_pat
     for folder in others:
         folder.mkdir()
     (tmp_path / ".a[1].txt.linked00.part").symlink_to(tmp_path / "far", target_is_directory=True)
-    with whole_file(tmp_path / "a[1].txt") as first:
+    with whole(tmp_path / "a[1].txt") as first:
         assert not abandoned.exists()
-        with whole_file(tmp_path / "a[1].txt") as second:
+        with whole(tmp_path / "a[1].txt") as second:
             first.write_text("first")
             second.write_text("second")
         assert (tmp_path / "a[1].txt").read_text() == "second"
@@ -154,7 +157,7 @@ def test_file_systems_without_locks_are_written_to(tmp_path, monkeypatch):
     monkeypatch.setattr("fcntl.flock", refuse)
     kept = tmp_path / ".a.txt.k2_w9xyz.part"  # could be in use
     kept.mkdir()
-    with whole_file(tmp_path / "a.txt") as part:
+    with whole(tmp_path / "a.txt") as part:
         part.write_text("whole")
     assert {path.name for path in tmp_path.iterdir()} == {"a.txt", kept.name}
 
@@ -184,7 +187,7 @@ def test_permissions_of_a_replaced_file_are_kept(tmp_path):
     path = tmp_path / "a.txt"
     path.write_text("old")
     path.chmod(0o640)
-    with whole_file(path) as part:
+    with whole(path) as part:
         part.write_text("new")
     assert (path.read_text(), path.stat().st_mode & 0o777) == ("new", 0o640)
 

@@ -11,10 +11,16 @@ from small_stack import CAMERA, TIMING
 
 import rsvib_torch as rsv
 from rsvib_torch.io import StackInfo
+from rsvib_torch.options import ProcessStackOptions
 from rsvib_torch.stacks.memory import memory_limit, memory_needed, windows_at_once
 
 LARGE = StackInfo((100, 4096, 4096), "uint16", 4095.0)
 GB = 10**9
+
+
+def at_once(info, window, memory, workers, device="cpu"):
+    options = {"window": window, "restoration": {}, "memory": memory, "workers": workers, "device": device}
+    return windows_at_once(info, ProcessStackOptions(**options))
 
 
 def test_default_limit_is_three_quarters_of_what_the_process_has_and_can_get(set_free):
@@ -27,27 +33,27 @@ def test_default_limit_is_three_quarters_of_what_the_process_has_and_can_get(set
 def test_window_that_does_not_fit_the_free_memory_is_refused(set_free):
     set_free(5 * GB)
     with pytest.raises(ValueError, match="three quarters of the memory that is free") as caught:
-        windows_at_once(LARGE, 8, {}, memory=None, workers=4)
+        at_once(LARGE, 8, None, 4)
     message = str(caught.value)
     required = re.search(r"a window of 8 frames of 4096 x 4096 px takes about ([0-9.]+) GB", message)
     assert float(required[1]) == pytest.approx(memory_needed(LARGE, 8, {}) / GB, rel=0.01)
     fitting = int(re.search(r"at most ([0-9]+) frames at once \(--window\)", message)[1])
-    assert windows_at_once(LARGE, fitting, {}, memory=None, workers=4) == 1
-    refuses(lambda: windows_at_once(LARGE, fitting + 1, {}, memory=None, workers=4), "too little")
-    assert windows_at_once(LARGE, 8, {}, memory="20GB", workers=4) == 1
+    assert at_once(LARGE, fitting, None, 4) == 1
+    refuses(lambda: at_once(LARGE, fitting + 1, None, 4), "too little")
+    assert at_once(LARGE, 8, "20GB", 4) == 1
 
 
 def test_frames_that_are_stored_together_count(set_free):
     set_free(100 * GB)
     info = StackInfo((100, 512, 512), "uint16", 4095.0, decoding_bytes=3 * GB)
     with pytest.raises(ValueError, match=r"store each frame separately: 3 GB are needed to decode frames"):
-        windows_at_once(info, 2, {}, memory="2GB", workers=1)
-    assert windows_at_once(info, 2, {}, memory="4GB", workers=1) == 1
+        at_once(info, 2, "2GB", 1)
+    assert at_once(info, 2, "4GB", 1) == 1
 
 
 def test_gpu_needs_less_memory_of_the_machine(set_free):
     set_free(5 * GB)
-    assert windows_at_once(LARGE, 8, {}, memory=None, workers=1, on_gpu=True) == 1
+    assert at_once(LARGE, 8, None, 1, "cuda") == 1
 
 
 def test_a_stack_that_does_not_fit_is_refused_by_every_command(tmp_path, set_free, capsys):

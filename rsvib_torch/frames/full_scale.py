@@ -1,4 +1,4 @@
-"""Conversion between pixels as stored and float frames whose full scale is 1."""
+"""Conversion between counts and float frames whose full scale is 1."""
 
 import math
 
@@ -32,25 +32,25 @@ def known_full_scale(dtype: np.dtype, stated: object = None) -> float | None:
     return value
 
 
-def required_full_scale(full_scale: float | None, dtype: np.dtype, name: object) -> float:
-    """The count of integers that corresponds to 1.0; the error names a file or an argument if it is unknown."""
-    if full_scale is None:
+def required_full_scale(full_scale: object, dtype: np.dtype, name: object) -> float:
+    """As ``known_full_scale`` of integers; the error names a file or an argument if it is unknown."""
+    known = known_full_scale(dtype, full_scale)
+    if known is None:
         raise ValueError(
             f"{name}: full scale of {dtype} frames unknown: pass full_scale, e.g. full_scale=4095 for 12-bit counts "
             "(commands: --full-scale 4095)"
         )
-    known = known_full_scale(dtype, full_scale)
-    assert known is not None  # of integers
     return known
 
 
-def full_scale_of_counts(counts: Array, full_scale: float | None, name: str) -> float:
-    """As ``required_full_scale``; a ``ValueError`` as well if counts exceed the full scale."""
-    full_scale = required_full_scale(full_scale, counts.dtype, name)
-    largest = int(counts.max(initial=0))
-    if largest > full_scale:
-        raise ValueError(f"{name}: {beyond_full_scale(largest, full_scale)}")
-    return full_scale
+def scaled_counts(counts: Tensor, full_scale: float | None, name: str, *, most: float = 1.0) -> Tensor:
+    """Counts of any integer type as float32 with full scale 1; those above ``most`` times full scale are refused."""
+    full_scale = required_full_scale(full_scale, np.dtype(str(counts.dtype).removeprefix("torch.")), name)
+    # float32 holds 16-bit counts exactly; PyTorch finds no largest value of some integers
+    floats = counts.to(torch.float32 if counts.dtype.itemsize <= 2 else torch.float64)
+    if floats.numel() and (largest := float(floats.max())) > most * full_scale:
+        raise ValueError(f"{name}: {beyond_full_scale(int(largest), full_scale)}")
+    return floats.div_(full_scale).to(torch.float32)
 
 
 def counts_to_frames(counts: Array, full_scale: float | None, name: str, nodata: float | None = None) -> Tensor:
@@ -62,12 +62,7 @@ def counts_to_frames(counts: Array, full_scale: float | None, name: str, nodata:
             return frames.masked_fill_(torch.from_numpy(missing), torch.nan)
     if counts.dtype.kind == "f":
         return torch.from_numpy(np.ascontiguousarray(counts, dtype=np.float32))
-    full_scale = full_scale_of_counts(counts, full_scale, name)
-    narrow = counts.dtype.itemsize <= 2  # float32 holds 16-bit counts exactly
-    # torch does not compute with all unsigned types
-    signed = counts if counts.dtype == np.uint8 else counts.astype(np.int32 if narrow else np.int64)
-    floats = torch.from_numpy(np.require(signed, None, ["C", "W"])).to(torch.float32 if narrow else torch.float64)
-    return floats.div_(full_scale).to(torch.float32)
+    return scaled_counts(torch.from_numpy(np.require(counts, None, ["C", "W"])), full_scale, name)
 
 
 def frames_to_counts(frames: Tensor, dtype: np.dtype, full_scale: float | None, nodata: float | None = None) -> Array:
