@@ -69,8 +69,8 @@ class MosaicSolver:
         """``P_k c_k``: polynomials of the Laplacian across the rows, with mirrored ends."""
         powers = coefficients.unflatten(0, (-1, SCALE))  # (rows, aliases, components, U)
         total = torch.zeros_like(powers)
-        for factors in zip(*self._precisions, strict=True):  # of each power, (aliases, U) for each component
-            total = total + torch.stack(factors, 1).to(powers.real.dtype) * powers
+        for factors in zip(*self._precisions, strict=True):  # of each power, (aliases, 1, U) for each component
+            total = total + torch.cat(factors, 1).to(powers.real.dtype) * powers
             wide = torch.cat([powers[:1], powers, powers[-1:]])
             powers = 2 * powers - wide[:-2] - wide[2:]
         return total.flatten(0, 1)

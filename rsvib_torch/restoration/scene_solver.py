@@ -86,7 +86,7 @@ class SceneSolver:
         blurred, scenes = observation.kernels.blurred, observation.num_scenes
 
         # Chunks of the frequencies; all at a time if their factors are kept.
-        most = frequencies if keep else max(1, most_values(device) // (scenes * rows * (2 * normal.width + 1)))
+        most = frequencies if keep else max(1, most_values(device) // (scenes * rows * normal.left.shape[1]))
         rounds = -(-frequencies // most)
         chunk = -(-frequencies // (8 * rounds)) * 8  # rows begin at full cache lines
         self._parts = runs(frequencies, min(chunk, frequencies))
