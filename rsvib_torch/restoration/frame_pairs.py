@@ -75,6 +75,11 @@ class CommonParts:
     rim: NDArray[np.int64]  # (N, 2) rows and columns at its ends that are not compared
 
     @property
+    def firsts(self) -> NDArray[np.int64]:
+        """(N, 2, 2) first row and column of the part in either frame."""
+        return np.stack([(-self.step).clip(0), self.step.clip(0)], 1)
+
+    @property
     def is_enough(self) -> NDArray[np.bool_]:
         """(N,) whether the compared part is larger than the filters."""
         enough: NDArray[np.bool_] = (self.size - 2 * self.rim).min(1) >= 2 * _RIM + 3
@@ -122,7 +127,7 @@ def cut_pairs(given: JudgedFrames, common: CommonParts, detailed: list[slice] | 
     """
     (height, width), (rim_y, rim_x) = common.size[0].tolist(), common.rim[0].tolist()
     (earlier, later), single = common.frames.T, given.restored.shape[1] == 1
-    first, second = (-common.step).clip(0), common.step.clip(0)  # row and column of the part in both frames
+    first, second = common.firsts[:, 0], common.firsts[:, 1]
 
     def cut(images: Tensor, frame: NDArray[np.int64], place: NDArray[np.int64]) -> Tensor:
         return cut_parts(images, (common.stack, frame), place[:, 0], place[:, 1], (height, width))
