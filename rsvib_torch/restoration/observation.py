@@ -57,7 +57,7 @@ _POLYNOMIAL = (
 
 
 def _kernel(distance: Tensor) -> Tensor:
-    """Kernel at distances of at most ``KERNEL_REACH``."""
+    """Kernel at distances of at most ``KERNEL_REACH``; the sum of its values at whole distances is 1 to 5e-4."""
     square = (distance / KERNEL_REACH).square()
     *lower, value = constant(np.array, _POLYNOMIAL, dtype=square.dtype, device=square.device).unbind()
     for coefficient in reversed(lower):

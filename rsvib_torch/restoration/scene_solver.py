@@ -154,16 +154,10 @@ class SceneSolver:
             solution = solve_halves(system, right)
             return join_windows(solution.unflatten(-1, (scenes, len(windows), -1)), windows)
 
+        numbers = range(len(self._parts))
         if differentiates:
-            return torch.cat([solve(number) for number in range(len(self._parts))], dim=-1)
-        channels = given.shape[-3 if given.ndim == 5 else 1]
-        coefficients: Tensor = given.new_empty(self.observation.count, channels, scenes, len(self.u))
-
-        def fill_part(number: int) -> None:
-            coefficients[..., self._parts[number]] = solve(number)
-
-        in_parallel(fill_part, range(len(self._parts)), given.device, at_most=MOST_THREADS)
-        return coefficients
+            return torch.cat([solve(number) for number in numbers], dim=-1)
+        return torch.cat(in_parallel(solve, numbers, given.device, at_most=MOST_THREADS), dim=-1)
 
     def predict(self, coefficients: Tensor) -> Tensor:
         """Noiseless frames (N, M, C, R, L) of the scenes, ``K c``."""
