@@ -30,7 +30,7 @@ from rsvib_torch.numerics.tables import (
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.frame_pairs import common_parts
 from rsvib_torch.restoration.observation import RowKernels
-from rsvib_torch.restoration.scene_prior import sample_rows
+from rsvib_torch.restoration.scene_prior import unexplained
 
 # Single images: the quietest blocks of a high-pass residual
 
@@ -176,10 +176,10 @@ def _residual_power(images: Tensor, displacement: Tensor, node_weights: Tensor) 
     kernels = RowKernels.of_rows(moved, node_weights, moved.new_ones(len(moved)), num_rows, margin=4 * _MIN_SIDE)
     count = min(24, width // 4)
     chosen = np.linspace(width // 4, width // 2, count, dtype=np.float32).astype(np.int64)
-    sample = sample_rows(images, kernels, chosen)
     # correlation 0.9 of neighbouring rows of the scene, of weight 1e-4 beside the data
     products = torch.tensor([[1.0, 0.9**2], [-0.9, 0.0]], dtype=torch.float64, device=images.device)
-    power, rest = sample.unexplained(1e-4 * products[:, :, None, None].expand(-1, -1, len(images), count))
+    precision = 1e-4 * products[:, :, None, None].expand(-1, -1, len(images), count)
+    power, rest = unexplained(images, kernels, chosen, precision)
     return torch.as_tensor(power[0].sum(-1) / rest[0].sum(-1), dtype=images.dtype, device=images.device)
 
 
