@@ -145,11 +145,6 @@ def brightness(frames: Tensor) -> Tensor:
     return frames[..., ::8, :].mean((-2, -1))
 
 
-def spread_starts(extent: int, size: int, count: int) -> NDArray[np.int64]:
-    """First rows or columns of ``count`` pieces of ``size`` px, evenly spread over ``extent`` px."""
-    return np.rint(np.linspace(0, extent - size, count)).astype(np.int64)
-
-
 def cut_pieces(images: Tensor, tops: NDArray[np.int64], lefts: NDArray[np.int64], size: tuple[int, int]) -> Tensor:
     """The pieces (..., n, m, *size) of images (..., H, W) from n rows and m columns on."""
     rows, columns = (
@@ -212,7 +207,7 @@ def observed_spectrum(frames: Tensor, motion: FrameMotion, levels: Tensor, lengt
     counts = [-(-2 * (whole - extent) // extent) + 1 for whole, extent in zip(shape, size, strict=True)]
     excess = max(1.0, math.sqrt(counts[0] * counts[1] / _PIECES))
     tops, lefts = (
-        spread_starts(whole, extent, max(1, round(count / excess)))
+        np.rint(np.linspace(0, whole - extent, max(1, round(count / excess)))).astype(np.int64)
         for whole, extent, count in zip(shape, size, counts, strict=True)
     )
     tapers = [constant(taper, extent, dtype=frames.dtype, device=frames.device) for extent in size]
