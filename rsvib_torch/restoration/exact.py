@@ -220,7 +220,7 @@ class FrameModel(MovingFrames):
         if self.clipped is not None:  # saturated pixels are at least as bright as their value
             floor = torch.full_like(data, -torch.inf)
             floor[..., :width] = torch.where(self.clipped[index], data[..., :width], -torch.inf)
-        return with_missing_values(problem, measured, floor)
+        return with_missing_values(problem, problem.solver(keep=True), measured, floor)
 
 
 def model_frames(given: MovingFrames, *, noise: float | Literal["auto"] = "auto", scale: int = 1) -> FrameModel:

@@ -62,7 +62,7 @@ class PolynomialPrior:
     period: int  # L, period of the rows in px
 
     def precision(self, noise_power: Tensor, strength: float = 1.0, blur_reach: float = 0.0) -> Tensor:
-        """Factors q_m of ``sum_m q_m(u - a) T^m`` in units of the data's noise, (p + 1, 2, U), float64.
+        """Factors q_m of ``sum_m q_m(u - a) T^m`` in units of the data's noise, (p + 1, 2, 1, U), float64.
 
         Arguments as in ``RowPrior.precision``.
         """
@@ -76,7 +76,7 @@ class PolynomialPrior:
         a = a.minimum(1e6 / _MAX_LAPLACIAN ** (m + n).double())
         a[0, 0] += 1e-5 / (1 + blur_reach)
         powers = _laplacian(u) ** torch.arange(_DEGREE + 1, device=u.device)[:, None, None]
-        return torch.einsum("mn,nau->mau", a, powers) / _pixel(u)
+        return (torch.einsum("mn,nau->mau", a, powers) / _pixel(u))[:, :, None]
 
 
 @torch.no_grad()
@@ -225,7 +225,7 @@ def finer_scene(problem: SceneProblem, width: int, neglected: float) -> tuple[Te
     0.002, 2 frames; 32.8 dB on pixels), 34.4 become 38.1 dB with 8 frames (34.7 dB on pixels). Displacements that the
     problem neglects, of standard deviation ``neglected`` px, count as noise as well, but do not contradict the motion.
     """
-    factor, relaxed, largest = 1.0, torch.ones_like(problem.precision[0, 0]), math.inf
+    factor, relaxed, largest = 1.0, torch.ones_like(problem.precision[0, 0, 0]), math.inf
     allowed, noticed = _MAX_EFFECT, False
     for _ in range(_SOLUTIONS):
         # 1. The scene, and the differences of its frames from their prediction.

@@ -19,7 +19,7 @@ from rsvib_torch.imaging.blur import form_rows, row_taps
 from rsvib_torch.motion.motion import ColumnMotion
 from rsvib_torch.numerics.interpolation import bspline_weights, correlated, extended_length, spline_spectra
 from rsvib_torch.numerics.tables import Array, tables
-from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion
+from rsvib_torch.restoration.frame_motion import FrameMotion, MovingFrames, frame_motion
 
 _STRIP = 160  # px, width of the strip of columns that is judged with roll or zoom: enough for the means of a pair
 _SMOOTHING = 5.0  # px, standard deviation of the Gaussian in ``misfit``; displacements of up to about 10 px stay linear
@@ -28,14 +28,11 @@ _NEAR = 8  # px around missing pixels within which the restored frame is a guess
 _MARGIN = 4  # px between the compared pixels and those outside the frame
 
 
-@dataclass(frozen=True, eq=False)
-class JudgedFrames:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class JudgedFrames(MovingFrames):
     """Raw frames of B stacks in row order, and the frames restored from them."""
 
-    images: Tensor  # (B, T, C, H, W)
-    restored: Tensor  # likewise, or (B, 1, C, H, W) in the coordinates of the earlier frame of each pair
-    missing: Tensor | None  # (B, T, C, H, W) bool, pixels without data
-    motion: FrameMotion
+    restored: Tensor  # as the images, or (B, 1, C, H, W) in the coordinates of the earlier frame of each pair
 
 
 def judged_strip(given: JudgedFrames) -> JudgedFrames:
@@ -55,12 +52,8 @@ def judged_strip(given: JudgedFrames) -> JudgedFrames:
     columns = torch.tensor(middles, dtype=torch.float64, device=both.device)
     starts = tuple(motion.frame_starts.tolist())
     of_strips = ColumnMotion(motion.vibration, columns, starts, motion.timing.row_time, height)
-    return JudgedFrames(
-        cut_columns(given.images, chosen),
-        cut_columns(given.restored, chosen),
-        None if given.missing is None else cut_columns(given.missing, chosen),
-        frame_motion(of_strips, motion.timing, motion.frame_starts, height),
-    )
+    of_frames = frame_motion(of_strips, motion.timing, motion.frame_starts, height)
+    return replace(given.mapped(lambda values: cut_columns(values, chosen)), motion=of_frames)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +66,11 @@ class CommonParts:
     step: NDArray[np.int64]  # (N, 2) displacement (y, x) in whole px of the content from the earlier to the later frame
     size: NDArray[np.int64]  # (N, 2) rows and columns of the part
     rim: NDArray[np.int64]  # (N, 2) rows and columns at its ends that are not compared
+
+    @property
+    def firsts(self) -> NDArray[np.int64]:
+        """(N, 2, 2) first row and column of the part in either frame."""
+        return np.stack([(-self.step).clip(0), self.step.clip(0)], 1)
 
     @property
     def is_enough(self) -> NDArray[np.bool_]:
@@ -122,7 +120,7 @@ def cut_pairs(given: JudgedFrames, common: CommonParts, detailed: list[slice] | 
     """
     (height, width), (rim_y, rim_x) = common.size[0].tolist(), common.rim[0].tolist()
     (earlier, later), single = common.frames.T, given.restored.shape[1] == 1
-    first, second = (-common.step).clip(0), common.step.clip(0)  # row and column of the part in both frames
+    first, second = common.firsts[:, 0], common.firsts[:, 1]
 
     def cut(images: Tensor, frame: NDArray[np.int64], place: NDArray[np.int64]) -> Tensor:
         return cut_parts(images, (common.stack, frame), place[:, 0], place[:, 1], (height, width))
@@ -143,8 +141,8 @@ def cut_pairs(given: JudgedFrames, common: CommonParts, detailed: list[slice] | 
     # 3. Predicted values at missing pixels, and the part that is compared.
     inner = (..., slice(rim_y, height - rim_y), slice(rim_x, width - rim_x))
     missing, compared_later = None, still_later
-    if given.missing is not None:
-        missing = torch.stack([cut(given.missing, earlier, first), cut(given.missing, later, second)], 1)
+    if given.ignore is not None:
+        missing = torch.stack([cut(given.ignore, earlier, first), cut(given.ignore, later, second)], 1)
         of_earlier = reblur(still[:, None], given.motion, common.stack, earlier, first[:, 0])[:, 0]
         raw = torch.where(missing[:, 0], of_earlier, raw)
         # what was restored near missing pixels of the earlier frame is a guess, which the later frame does not confirm

@@ -156,10 +156,11 @@ def judge_prepared(
     most_pairs: int | None = None,
 ) -> RestorationVerdict:
     """``judge_restoration`` of one stack of prepared frames; restored ones (1, T, C, H, W) are in row order."""
-    (pairs,) = judge_stacks(frames, restored, motion_of_frames(frames, vibration), joint=joint, most_pairs=most_pairs)
-    if isinstance(pairs, TooLittleInCommonError):
-        raise pairs
-    return verdict_on_stack(pairs, frames.image_timing, restored.device)
+    motion = motion_of_frames(frames, vibration)
+    (verdict,) = judge_stacks(frames, restored, motion, joint=joint, most_pairs=most_pairs)
+    if isinstance(verdict, TooLittleInCommonError):
+        raise verdict
+    return verdict
 
 
 @torch.no_grad()
@@ -172,8 +173,8 @@ def judge_stacks(
     joint: bool | int = False,
     most_pairs: int | None = None,
     columns: int | None = None,
-) -> list[list[PairVerdict] | TooLittleInCommonError]:
-    """Verdicts on the pairs of some stacks of a batch, or errors if two frames have too little in common.
+) -> list[RestorationVerdict | TooLittleInCommonError]:
+    """Verdicts on some stacks of a batch, or errors if two frames have too little in common.
 
     Restored frames (B, T, C, H, W), or (B, 1, C, H, W), are in row order. Only the ``columns`` with the most detail are
     used.
@@ -183,7 +184,7 @@ def judge_stacks(
     pairs = pairs_to_judge(motion.shift.shape[1], joint, most)
     dtype = torch.promote_types(frames.images.dtype, restored.dtype)
     raw, still = (images.to(dtype) for images in frames.compared(restored))
-    given = judged_strip(JudgedFrames(raw, still, frames.missing, motion))
+    given = judged_strip(JudgedFrames(images=raw, restored=still, ignore=frames.missing, motion=motion))
     numbers = np.array([(stack, *pair) for stack in stacks for pair in pairs], np.int64).reshape(-1, 3)
     detailed = None if columns is None else detailed_parts(given.images, columns)
     common = common_parts(given.motion, numbers, given.images.shape[-2:])
@@ -203,7 +204,7 @@ def judge_stacks(
             advance(len(some))
 
     # 3. The verdicts on all pairs of each stack.
-    verdicts: list[list[PairVerdict] | TooLittleInCommonError] = []
+    verdicts: list[RestorationVerdict | TooLittleInCommonError] = []
     for of_stack in np.arange(len(numbers)).reshape(-1, len(pairs)).tolist():
         apart = [number for number in of_stack if number not in judged]
         if apart:
@@ -216,11 +217,11 @@ def judge_stacks(
                 )
             )
         else:
-            verdicts.append([judged[number] for number in of_stack])
+            verdicts.append(_joined([judged[number] for number in of_stack], frames.image_timing, restored.device))
     return verdicts
 
 
-def verdict_on_stack(pairs: list[PairVerdict], timing: SensorTiming, device: torch.device) -> RestorationVerdict:
+def _joined(pairs: list[PairVerdict], timing: SensorTiming, device: torch.device) -> RestorationVerdict:
     """One verdict from those on all pairs of a stack, in image axes."""
     levels, displacements, outcomes, reasons = zip(*pairs, strict=True)
     moved = torch.from_numpy(np.stack(displacements, 1)).to(device)  # (3, P, 2)
@@ -295,21 +296,15 @@ def _judge_pairs(
     # 5. The outcomes; a gain of the opposite sign is not stated.
     verdicts: list[PairVerdict] = []
     levels = np.stack([np.sqrt(before), np.sqrt(after), np.sqrt(noise), unexplained / noise, gain], 1)
-    for n, (one, moves, between) in enumerate(zip(displacements, common.moves, np.stack(offset, 1), strict=True)):
-        single = pairs.restored_later is None
-        misfits_of_pair, after_of_pair, resolution = one.tolist()
+    single, offsets = pairs.restored_later is None, np.stack(offset, 1)
+    for n, (raw_misfit, rest, resolution) in enumerate(displacements.tolist()):
+        moves, between = common.moves[n].tolist(), offsets[n].tolist()
         outcome, reasons = outcome_of_pair(
-            misfits_of_pair,
-            after_of_pair,
-            resolution,
-            moves.tolist(),
-            between.tolist(),
-            float(gain[n]),
-            one_image=single,
+            raw_misfit, rest, resolution, moves, between, float(gain[n]), one_image=single
         )
         if (outcome == "worse" and gain[n] > 0) or (outcome in ("helps", "partly") and gain[n] < 0):
             levels[n, -1] = math.nan
         if missing[n] > _MAX_MISSING:
             outcome, reasons = "unknown", (Reason("pixels_missing", None, float(missing[n]), _MAX_MISSING),)
-        verdicts.append(PairVerdict(levels[n], one, outcome, reasons))
+        verdicts.append(PairVerdict(levels[n], displacements[n], outcome, reasons))
     return verdicts

@@ -18,102 +18,20 @@ from rsvib_torch.restoration.frame_motion import FrameMotion, MovingFrames, join
 from rsvib_torch.restoration.noise import noise_levels
 from rsvib_torch.restoration.observation import SCALE, Observation, RowKernels
 from rsvib_torch.restoration.priors import check_prior
-from rsvib_torch.restoration.scene_solver import MIN_LEVEL, SceneSolver, measured_values, scene_period
+from rsvib_torch.restoration.scene_solver import (
+    MIN_LEVEL,
+    SceneProblem,
+    measured_values,
+    scene_period,
+    with_missing_values,
+)
 
 # Luminance, red - blue, and magenta - green. Orthonormal, so that white noise stays white; the three components of a
 # scene are nearly independent, those of the colours are not.
 _COMPONENTS = ((3**-0.5,) * 3, (2**-0.5, 0.0, -(2**-0.5)), (6**-0.5, -2 * 6**-0.5, 6**-0.5))
-# Weight of the local means in place of missing pixels, so that holes that no frame sees are filled: 0.01 instead loses
-# 0.5 to 0.9 dB, 0 loses 4 dB (hole of 16 px in all frames, noise 0.003).
-_FILLED = 0.001
-
-
-def _components(colours: Tensor) -> Tensor:
-    """Components (M, 3, R, L) of colours (M, 3, R, L)."""
-    return torch.einsum("kc,mcrl->mkrl", colours.new_tensor(_COMPONENTS), colours)
-
-
-def _colours(components: Tensor) -> Tensor:
-    """Inverse of ``_components``."""
-    return torch.einsum("kc,mkrl->mcrl", components.new_tensor(_COMPONENTS), components)
-
-
-class MosaicSolver:
-    """Minimises ``sum_m w_m |V_m^(1/2) (g_m - K_m c)|^2 + sum_k c_k^H P_k c_k`` for the components c_k of a scene.
-
-    The ``weights`` V, (M, 3, R, L) or (1, 3, R, L), of the colours of a pixel couple all frequencies and components.
-    Conjugate gradients are preconditioned by the banded systems of each component with V replaced by its mean. The
-    ``precisions`` P_k are as from ``PolynomialPrior.precision``.
-    """
-
-    def __init__(self, observation: Observation, weights: Tensor, precisions: list[Tensor]) -> None:
-        self._observation, self._weights, self._precisions = observation, weights, precisions
-        inside = (weights > 0).any(1, keepdim=True)
-        self._inside = inside.to(weights.dtype)
-        squares = weights.new_tensor(_COMPONENTS).square()
-        self._density = (squares @ weights.sum((0, 2, 3))) / self._inside.sum()
-        self._solvers = []
-        for density, precision in zip(self._density.tolist(), precisions, strict=True):
-            part = observation.weighted(density * observation.kernels.weight)
-            solver = SceneSolver(part, precision)
-            self._solvers.append(solver if solver.interpolates else SceneSolver(part, precision, keep=True))
-
-    def predict(self, coefficients: Tensor) -> Tensor:
-        """Colours (M, 3, R, L) of noiseless frames of a scene with coefficients (K, 3, U)."""
-        return _colours(self._observation.A(coefficients[:, :, None])[0])
-
-    def _adjoint(self, colours: Tensor) -> Tensor:
-        return self._observation.A_adjoint(_components(colours)[None])[:, :, 0]
-
-    def _penalty(self, coefficients: Tensor) -> Tensor:
-        """``P_k c_k``: polynomials of the Laplacian across the rows, with mirrored ends."""
-        powers = coefficients.unflatten(0, (-1, SCALE))  # (rows, aliases, components, U)
-        total = torch.zeros_like(powers)
-        for factors in zip(*self._precisions, strict=True):  # of each power, (aliases, U) for each component
-            total = total + torch.stack(factors, 1).to(powers.real.dtype) * powers
-            wide = torch.cat([powers[:1], powers, powers[-1:]])
-            powers = 2 * powers - wide[:-2] - wide[2:]
-        return total.flatten(0, 1)
-
-    def _preconditioned(self, right: Tensor) -> Tensor:
-        parts = zip(self._solvers, right.split(1, 1), strict=True)
-        return torch.cat([solver.solve(part[:, :, None])[:, :, 0] for solver, part in parts], dim=1)
-
-    def _dot(self, one: Tensor, other: Tensor) -> Tensor:
-        """Inner product of the real scenes."""
-        products = (one.conj() * other).real
-        count = torch.full(products.shape[-1:], 2.0, dtype=torch.float64, device=products.device)
-        count[0] = 1.0
-        if self._observation.period % 2 == 0:
-            count[-1] = 1.0
-        return products.sum((0, 1), dtype=torch.float64) @ count
-
-    def fit(self, data: Tensor, start: Tensor | None = None, *, iterations: int) -> Tensor:
-        """Coefficients (K, 3, U) for measured or assumed colours (M, 3, R, L), from the solution with the mean weights.
-
-        Iterations stop at a hundredth of the residual of the start.
-        """
-        if start is None:
-            start = self._preconditioned(self._adjoint(self._inside * data) * self._density[:, None])
-        result = start
-        residual = self._adjoint(self._weights * (data - self.predict(result))) - self._penalty(result)
-        step = self._preconditioned(residual)
-        energy = first = self._dot(residual, step)
-        for _ in range(iterations):
-            if not bool(energy > 1e-4 * first):
-                break
-            image = self._adjoint(self._weights * self.predict(step)) + self._penalty(step)
-            length = (energy / self._dot(step, image)).to(data.dtype)
-            result = result + length * step
-            residual = residual - length * image
-            next_step = self._preconditioned(residual)
-            before, energy = energy, self._dot(residual, next_step)
-            step = next_step + (energy / before).to(data.dtype) * step
-        return result
-
-    def image(self, coefficients: Tensor) -> Tensor:
-        """Colours (3, 2 R, 2 L) of the scene at half pixels."""
-        return _colours(self._observation.image(coefficients[:, :, None]))[0]
+# Of the filled values, in units of the noise. With 0.05, the noise level is up to 40 % too low, and images of four
+# frames lose 0.5 to 1.3 dB (noise 0.003 and 0.01); 0.01 takes 1.2 to 1.4 times as long for six and eight frames.
+_ACCURACY = 0.02
 
 
 def restore_mosaic(given: MovingFrames, colours: Tensor, options: ExactOptions) -> Tensor:
@@ -141,7 +59,10 @@ def restore_mosaic(given: MovingFrames, colours: Tensor, options: ExactOptions) 
         # 3. The colours of a stack, interpolated where they are not measured, and the level of its noise.
         measured = measures(colours[stack])
         linear = interpolated_colours(mosaic, colours[stack])
-        floor = None if given.clipped is None else torch.where(measured & given.clipped[stack], mosaic, -torch.inf)
+        floor = None
+        if given.clipped is not None:
+            floor = torch.where(measured & given.clipped[stack], mosaic, -torch.inf)
+            measured = measured & ~given.clipped[stack]
         if given.ignore is not None:
             measured = measured & ~given.ignore[stack]
         if options.noise == "auto":  # of colours whose noise was halved by interpolation
@@ -157,10 +78,10 @@ def restore_mosaic(given: MovingFrames, colours: Tensor, options: ExactOptions) 
                 values, pattern = mosaic[members].expand_as(part[0]), measures(colours[stack][:1])[0]
                 filled = similar_patches(part[0], values, pattern, level, rounds=8, steps=6)
                 part = (filled, torch.ones_like(part[1]), None, level / 2)
-            # 5. The observation operator, and the scene.
-            of_frames, weight = motion.of([stack], members), frames.new_ones(len(members))
-            kernels = RowKernels.of_rows(moved, node_weights, weight, height, points=SCALE)
-            observation = Observation(kernels, height, length, frames.dtype)
+            # 5. The observation operator, of three components of the scene, and the scene.
+            of_frames, weight = motion.of([stack], members), frames.new_ones(3 * len(members))
+            kernels = RowKernels.of_rows(moved.repeat(3, 1, 1, 1), node_weights, weight, height, points=SCALE)
+            observation = Observation(kernels, height, length, frames.dtype, 3)
             along = of_frames.shift[0, :, 0] - motion.shift[stack, reference, 0]
             images.append(_scene(*part, of_frames, observation, along, options))
             advance()
@@ -183,49 +104,57 @@ def _scene(
     ``along`` (M,) are px by which the frames are moved along the rows relative to the restored one. An unknown noise
     level is estimated from the residual of the first fit, if there are several frames.
     """
-    # 1. Deviations from the mean, extended to the period, and the weights of the measured and of the filled values.
+    # 1. Deviations from the mean, extended to the period, and which of them are measured, (3, M, 1, R, L). White noise
+    # in place of the data of several frames is a second channel.
     count, width, scale, length = len(images), images.shape[-1], options.scale, observation.period
     mean = images.mean((0, 2, 3))[:, None, None]
-    data = extend_rows(images - mean, length)
-    inside = measured_values(along[None], None, data[None].shape, width, ends=True)[0]
-    nowhere = ~known.any(1, keepdim=True)
-    measured, filled = (functional.pad(mask, (0, length - width)) & inside for mask in (known, nowhere))
-    full = images.detach()
+    components = images.new_tensor(_COMPONENTS)
+    data = extend_rows(images - mean, length).transpose(0, 1)[:, :, None]
+    unknown = ~known.transpose(0, 1)[:, :, None]
+    measured = measured_values(along.expand(3, -1), unknown, data.shape, width, ends=True)
+    noise = torch.randn(data.shape, generator=torch.Generator(data.device).manual_seed(0), device=data.device)
+    noise = noise.to(data.dtype) * level * measured
 
-    def solver(strength: float) -> MosaicSolver:
-        """With priors of the components fitted to ``full`` frames."""
-        weights = measured.to(data.dtype).masked_fill(filled, _FILLED)
+    def problem(colours: Tensor, full: Tensor, level: Tensor, strength: float) -> SceneProblem:
+        """The components of colours (3, M, C, R, L), with priors fitted to those of ``full`` frames (M, 3, H, W)."""
         levels, reach = level.expand(1, count), observation.kernels.blur_reach
-        priors = (
-            fit_polynomial_prior(component[None, :, None], motion, levels, length)
-            for component in _components(full - mean).unbind(1)
-        )
-        precisions = [prior.precision(level.square(), strength, reach) for prior in priors]
-        return MosaicSolver(observation, weights, precisions)
+        parts = torch.einsum("kc,mcrl->kmrl", components, full - mean)
+        priors = [fit_polynomial_prior(part[None, :, None], motion, levels, length) for part in parts]
+        precision = torch.cat([prior.precision(level.square(), strength, reach) for prior in priors], 2)
+        mixed = torch.einsum("kc,cmnrl->kmnrl", components, colours)
+        return SceneProblem(mixed, observation, precision, level.expand(3), components)
 
     # 2. Fit twice, with priors fitted to predicted instead of interpolated colours: 1 to 3 dB for eight frames. The
     # interpolated ones lack detail, so that their prior is too strong: 0.01 instead of 1 gains 2 to 3 dB for eight
     # frames, 1.4 dB for two, 0.1 dB for one (noise 0.002; 0.0 dB at noise 0.01).
-    first = solver(0.01 * options.regularisation)
-    coefficients = first.fit(data, iterations=12)
+    colours = torch.cat([data, noise], 2) if count > 1 else data
+    first = problem(colours, images.detach(), level, 0.01 * options.regularisation)
+    solver = first.solver(keep=True)
+    filled = with_missing_values(first, solver, measured, iterations=12, accuracy=_ACCURACY)
     gain = None
     with torch.no_grad():
-        predicted = first.predict(coefficients)
-        full = torch.where(known, full, predicted[..., :width] + mean)
+        coefficients = solver.fit(filled.data)
+        predicted = filled.mixed(solver.predict(coefficients))
+        full = torch.where(known, images, predicted[:, :, 0, :, :width].transpose(0, 1) + mean)
         if count > 1:
-            residual_level, gain = _residual_level(first, data - predicted, measured)
+            # the noise of the frames, and of the scene in its units: relative to white noise in place of the data
+            residual, left = ((colours - predicted) * measured).unbind(2)
+            residual_level = level * (residual.square().sum() / left.square().sum()).sqrt()
+            gain = solver.image(coefficients)[:, 1].square().mean().sqrt() / level
             if options.noise == "auto":
-                level = residual_level
+                level = residual_level.clamp(min=MIN_LEVEL)
             elif bool(residual_level > 1.5 * level):
                 warn_of_restoration(
                     f"the frames differ from their model by {float(residual_level / level):.1f} times the stated "
                     "noise: the vibration is not accurate enough, the scene changes between the frames, or noise "
                     "is too low; colours may be false"
                 )
-        if floor is not None:  # saturated values are lower bounds: only those above the prediction count
-            measured[..., :width] &= (predicted[..., :width] + mean <= floor) | floor.isinf()
-    second = solver(options.regularisation)
-    scene = second.image(second.fit(data, coefficients, iterations=20)) + mean
+    second = problem(filled.mixed(filled.data)[:, :, :1], full, level, options.regularisation)
+    if floor is not None:
+        floor = functional.pad(floor - mean, (0, length - width), value=-torch.inf).transpose(0, 1)[:, :, None]
+    solver = second.solver(keep=True)
+    second = with_missing_values(second, solver, measured, floor, iterations=20, accuracy=_ACCURACY)
+    scene = second.mixed(solver.image(solver.fit(second.data)))[:, 0] + mean
     scene = scene[:, :: SCALE // scale, : SCALE * width : SCALE // scale]
     if gain is None:
         return scene
@@ -245,19 +174,6 @@ def _same_colours(displacement: Tensor, node_weights: Tensor) -> bool:
             "interpolated, as from one frame; restore more vibrating frames jointly"
         )
     return same
-
-
-def _residual_level(solver: MosaicSolver, residual: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
-    """Standard deviation of the noise of frames, and of that of the scene in its units.
-
-    The first is the residual relative to that of white noise of variance 1 in its place.
-    """
-    generator = torch.Generator(device=residual.device).manual_seed(0)
-    noise = torch.randn(residual.shape, generator=generator, dtype=residual.dtype, device=residual.device) * measured
-    coefficients = solver.fit(noise, iterations=8)
-    left = noise - solver.predict(coefficients)
-    level = ((residual * measured).square().sum() / (noise * left).sum().clamp(min=1.0)).sqrt()
-    return level.clamp(min=MIN_LEVEL), solver.image(coefficients).square().mean().sqrt()
 
 
 _PATCH = 4  # px; 3 px: -0.6 to -1.2 dB, 5 px: -0.3 to +0.1 dB in three times the time

@@ -16,10 +16,21 @@ from torch import Tensor
 
 from rsvib_torch.execution.parallel import at_once, runs
 from rsvib_torch.frames.pixels import cut_parts
-from rsvib_torch.numerics.tables import Array, constant, median, quantile, table, tables, valid_mean, without_nan
+from rsvib_torch.numerics.tables import (
+    Array,
+    constant,
+    median,
+    quantile,
+    table,
+    tables,
+    take_stacks,
+    valid_mean,
+    without_nan,
+)
 from rsvib_torch.restoration.frame_motion import FrameMotion
+from rsvib_torch.restoration.frame_pairs import common_parts
 from rsvib_torch.restoration.observation import RowKernels
-from rsvib_torch.restoration.scene_prior import sample_rows
+from rsvib_torch.restoration.scene_prior import unexplained
 
 # Single images: the quietest blocks of a high-pass residual
 
@@ -108,63 +119,48 @@ _MAX_MISSING = 0.1  # share of the compared pixels
 
 @torch.no_grad()
 def noise_of_frame_pair(frames: Tensor, motion: FrameMotion, ignore: Tensor | None, high_pass: Tensor) -> Tensor:
-    """Noise power (B, T) of each frame from the two middle ones of its stack that have content.
+    """Noise power (B, T) of each frame, from the two middle ones of its stack that have content.
 
-    The least-squares scene of both frames leaves a residual without texture. What texture adds to ``high_pass`` is
-    measured as the difference between that estimate and the residual, and assumed equal in all frames. NaN for stacks
-    in which fewer than two frames have content, or too many of the compared pixels are missing. Frames (B, T, C, H, W)
-    have local means at pixels to ``ignore``, and ``high_pass`` is NaN for frames without content.
+    The least-squares scene of both frames leaves a residual without texture. What texture adds to ``high_pass`` is the
+    difference between that estimate and the residual, and assumed equal in all frames. NaN for stacks in which fewer
+    than two frames have content, or too many of the compared pixels are missing. Frames (B, T, C, H, W) have local
+    means at pixels to ``ignore``, and ``high_pass`` is NaN for frames without content.
     """
     result = torch.full_like(high_pass, math.nan)
-    size = frames.shape[-2], frames.shape[-1]
-    least = max(min(_MIN_SIDE, *size), 8)
-    # the two frames of each stack, and the displacement (y, x) of the content between them
-    shifts, known = motion.shift.flip(-1).cpu().numpy().astype(int), (~high_pass.isnan()).cpu().numpy()
-    pairs = {}
-    for stack, usable in enumerate(known):
-        (numbers,) = usable.nonzero()
-        members = numbers[(len(numbers) - 1) // 2 :][:2]
-        if len(members) == 2:
-            step = shifts[stack, members[1]] - shifts[stack, members[0]]
-            if min(size - abs(step)) >= least:
-                pairs[stack] = members, step
-    if not pairs:
+    size = frames.shape[-2:]
+    # 1. The two frames of each stack, and the part of the scene that both contain: of one size, at most 256 rows from
+    # its middle, as more rows hardly lower the variance.
+    usable = [np.flatnonzero(row) for row in table(~high_pass.isnan())]
+    pairs = [(stack, *some[(len(some) - 1) // 2 :][:2]) for stack, some in enumerate(usable) if len(some) > 1]
+    common = common_parts(motion, np.array(pairs, np.int64).reshape(-1, 3), size)
+    common = take_stacks([common], common.size.min(1) >= max(min(_MIN_SIDE, *size), 8))
+    if not len(common.stack):
         return result
-    # rows and columns of the scene that both frames of all stacks contain: at least as many as needed
-    common = size - np.abs([step for _, step in pairs.values()]).max(0)
-    num_rows, columns = min(common[0], 256), common[1]  # from the middle: more rows hardly lower the variance
-    stacks = list(pairs)
-    members = np.stack([members for members, _ in pairs.values()])  # (S, 2)
-    steps = np.stack([step for _, step in pairs.values()])
-    firsts = np.stack([(-steps).clip(0), steps.clip(0)], 1)  # (S, 2, axes)
-    tops, lefts = firsts[..., 0] + ((size[0] - abs(steps[:, :1])) - num_rows) // 2, firsts[..., 1]
+    height, width = common.size.min(0)
+    num_rows = min(height, 256)
+    tops, lefts = common.firsts[..., 0] + (common.size[:, :1] - num_rows) // 2, common.firsts[..., 1]
 
     def shared(values: Tensor) -> Tensor:
-        places = zip(members.T, tops.T, lefts.T, strict=True)
         parts = [
-            cut_parts(values, (np.array(stacks), frame), top, left, (num_rows, columns)) for frame, top, left in places
+            cut_parts(values, (common.stack, common.frames[:, one]), tops[:, one], lefts[:, one], (num_rows, width))
+            for one in (0, 1)
         ]
         return torch.stack(parts, 1)
 
+    # 2. Noise of both frames, relative to the high-pass estimate, which counts texture as noise.
     images, ignored = shared(frames), None if ignore is None else shared(ignore)
-    measured_share = torch.ones_like(high_pass[stacks, 0])
+    measured_share = torch.ones_like(high_pass[common.stack, 0])
     if ignored is not None:
         measured_share = 1.0 - ignored.any(1).to(images.dtype).mean((1, 2, 3))
-    # noise of both frames, and texture that the high-pass estimate counts as noise
-    stack_of, member_of, top_of = (torch.as_tensor(values, device=frames.device) for values in (stacks, members, tops))
-    rows = top_of[..., None] + torch.arange(num_rows, device=frames.device)
+    stack, members = common.stack[:, None], common.frames
     displacement, node_weights = motion.exposures
-    moved = displacement[stack_of[:, None, None], member_of[..., None], rows]
-    moved = moved - motion.shift[stack_of[:, None], member_of][:, :, None, None]
+    moved = displacement[stack[..., None], members[..., None], tops[..., None] + np.arange(num_rows)]
+    moved = moved - motion.shift[stack, members][:, :, None, None]
     noise = _residual_power(images, moved, node_weights) / measured_share
-    alone = estimate_noise(images, ignored).square().mean(-1)
-    texture = (alone.mean(1) - noise).clamp(min=0.0)[:, None]
-    # neither frame has more noise than both together; blur may leave one of them more texture than the other
-    known_power, noise = high_pass[stacks], noise[:, None]
-    upper = 2.0 * noise + (known_power - alone.amax(1, keepdim=True)).clamp(min=0.0)
-    estimate = torch.maximum(known_power - texture, 0.5 * torch.minimum(known_power, noise)).minimum(upper)
-    too_few = (measured_share < 1.0 - _MAX_MISSING)[:, None]
-    result[stacks] = estimate.masked_fill(too_few, math.nan)
+    texture = (estimate_noise(images, ignored).square().mean((1, 2)) - noise).clamp(min=0.0)
+    noise, known = noise[:, None], high_pass[common.stack]
+    power = torch.maximum(known - texture[:, None], 0.5 * torch.minimum(known, noise))
+    result[common.stack] = power.masked_fill((measured_share < 1.0 - _MAX_MISSING)[:, None], math.nan)
     return result
 
 
@@ -180,10 +176,10 @@ def _residual_power(images: Tensor, displacement: Tensor, node_weights: Tensor) 
     kernels = RowKernels.of_rows(moved, node_weights, moved.new_ones(len(moved)), num_rows, margin=4 * _MIN_SIDE)
     count = min(24, width // 4)
     chosen = np.linspace(width // 4, width // 2, count, dtype=np.float32).astype(np.int64)
-    sample = sample_rows(images, kernels, chosen)
     # correlation 0.9 of neighbouring rows of the scene, of weight 1e-4 beside the data
     products = torch.tensor([[1.0, 0.9**2], [-0.9, 0.0]], dtype=torch.float64, device=images.device)
-    power, rest = sample.unexplained(1e-4 * products[:, :, None, None].expand(-1, -1, len(images), count))
+    precision = 1e-4 * products[:, :, None, None].expand(-1, -1, len(images), count)
+    power, rest = unexplained(images, kernels, chosen, precision)
     return torch.as_tensor(power[0].sum(-1) / rest[0].sum(-1), dtype=images.dtype, device=images.device)
 
 

@@ -26,14 +26,15 @@ from functools import cache, cached_property, partial
 import numpy as np
 import torch
 from numpy.polynomial.chebyshev import chebvander
-from numpy.typing import NDArray
+from scipy.special import comb
 from torch import Tensor
+from torch.nn import functional
 
 from rsvib_torch.execution.parallel import at_once, runs
 from rsvib_torch.imaging.blur import row_taps, row_transfer
 from rsvib_torch.numerics.banded_solver import from_both_ends
 from rsvib_torch.numerics.interpolation import bspline_weights, correlated, gauss_legendre, shift_phases, waves
-from rsvib_torch.numerics.tables import constant
+from rsvib_torch.numerics.tables import Array, constant
 
 KERNEL_REACH = 3  # rows on either side; support of the kernel
 TAPS = 2 * KERNEL_REACH
@@ -56,7 +57,7 @@ _POLYNOMIAL = (
 
 
 def _kernel(distance: Tensor) -> Tensor:
-    """Kernel at distances of at most ``KERNEL_REACH``."""
+    """Kernel at distances of at most ``KERNEL_REACH``; the sum of its values at whole distances is 1 to 5e-4."""
     square = (distance / KERNEL_REACH).square()
     *lower, value = constant(np.array, _POLYNOMIAL, dtype=square.dtype, device=square.device).unbind()
     for coefficient in reversed(lower):
@@ -217,101 +218,74 @@ def _stacked(values: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class SmoothBand:
-    """Normal matrices of N scenes at any frequencies by one matrix product, to which the prior is added."""
+    """Normal matrices of N scenes at any frequencies by one matrix product, to which the prior is added.
 
-    # (R + b, 2 b + 1, N, 2 Q) real and imaginary parts at Q nodes of systems of R rows; the last b rows are 0. In
-    # windows the halves (H + b, 2 b + 1, 2, N W, 2 Q) as from ``from_both_ends`` of W windows of each scene
+    In windows, both tensors are halves as from ``from_both_ends``: of W windows of each scene.
+    """
+
+    # (R + b, 2 b + 1, N, 2 Q) real and imaginary parts at Q nodes of systems of R rows, the last b rows are 0; in
+    # windows (H + b, 2 b + 1, 2, N W, 2 Q)
     left: Tensor
+    prior: Tensor  # (R + b, 2 b + 1, P) matrices whose sum with factors is the precision; (H + b, 2 b + 1, 2, W, P)
+    order: int  # of the prior: its matrices have so many diagonals on either side, but 0
     reach: float  # largest distance along the rows in px of the products of kernels
-    windows: int = 1  # W
-    rows: int = 0  # R, in windows
-
-    @property
-    def width(self) -> int:
-        """The half-width b of the band."""
-        return self.left.shape[1] // 2
 
     def in_windows(self, windows: list[slice]) -> "SmoothBand":
         """The matrices of all rows as those of windows of rows, eliminated from both ends."""
-        parts = torch.stack([self.left[window] for window in windows], dim=3).flatten(2, 3)
-        left = from_both_ends(torch.cat([parts, parts.new_zeros(self.width, *parts.shape[1:])]))
-        return replace(self, left=left, windows=len(windows), rows=len(parts))
+        width = self.left.shape[1] // 2
+
+        def halves(values: Tensor) -> Tensor:
+            parts = torch.stack([values[window] for window in windows], dim=3).flatten(2, 3)
+            return from_both_ends(torch.cat([parts, parts.new_zeros(width, *parts.shape[1:])]))
+
+        return replace(self, left=halves(self.left), prior=halves(self.prior[:, :, None]))
 
     def at(self, u: Tensor, precision: Tensor) -> Tensor:
         """Halves (H + b, 2 b + 1, 2 n U) of the matrices in windows, complex, at frequencies u (U,) in cycles per px.
 
-        The ``precision`` are products (p + 1, p + 1, N, U) of the prior there; those of several priors, of all scenes
-        one after the other, make as many matrices of each scene.
+        The ``precision`` are factors (p, q, N, U) of the P = p q matrices of the prior there; those of several priors,
+        of all scenes one after the other, make as many matrices of each scene.
         """
-        bands = self._product(interpolation_matrix(self.reach, u, self.left.dtype)[1])
-        priors = precision.shape[2] * self.windows // bands.shape[3]
+        interpolation = interpolation_matrix(self.reach, u, self.left.dtype)[1]
+        bands = (self.left @ interpolation.to(self.left)).unflatten(-1, (-1, 2))
+        width, windows = bands.shape[1] // 2, self.prior.shape[3]
+        priors = precision.shape[2] * windows // bands.shape[3]
         bands = bands if priors == 1 else bands.repeat(1, 1, 1, priors, 1, 1)
-        order, half = len(precision) - 1, len(self.left) - self.width
-        # what is added to the diagonals of the first p rows of the scene, of all rows, and of the first p middle rows
-        selected = constant(prior_diagonals, order, dtype=precision.dtype, device=precision.device)
-        added = (selected @ precision.reshape((order + 1) ** 2, -1)).to(bands.dtype)
-        added = added.view(2 * order + 1, 2 * order + 1, *precision.shape[2:3], 1, precision.shape[3])
-        ends, inner, middle = added.split([order, 1, order])
-        # real parts of the diagonals of both halves (H + b, 2 p + 1, N, W, U)
-        near = bands[:, self.width - order : self.width + order + 1, ..., 0].unflatten(3, (-1, self.windows))
-        first, second = near[:, :, 0], near[:, :, 1]
-        first[:half].add_(inner)
-        # the entries between the middle rows are in the first half only
-        eliminated = self.rows - half
-        second[:eliminated].add_(inner)
-        second[eliminated : eliminated + order].add_(middle)
-        # rows at the ends of the scene are predicted from fewer rows
-        first[:order, ..., :1, :].add_(ends)
-        second[:order, ..., -1:, :].add_(ends)
+        # real parts of the diagonals of both halves (H + b, 2 o + 1, 2, N, W, U)
+        near = slice(width - self.order, width + self.order + 1)
+        real = bands[:, near, ..., 0].unflatten(3, (-1, windows))
+        # sum over the matrices of the prior
+        real += torch.einsum("rdewp,pnu->rdenwu", self.prior[:, near], precision.flatten(0, 1).to(self.prior))
         return torch.view_as_complex(bands).flatten(2)
 
-    def _product(self, right: Tensor) -> Tensor:
-        """Products (H + b, 2 b + 1, 2, n, U, 2) with a matrix."""
-        return (self.left @ right.to(self.left)).unflatten(-1, (-1, 2))
 
+def autoregressive_bands(count: int, order: int) -> Array:
+    """Bands (K, 2 p + 1, (p + 1)^2) of the precision of K rows for each product (d, k) as of ``RowPrior.products``.
 
-@dataclass(frozen=True, eq=False)
-class FinerBand(SmoothBand):
-    """Those on the finer grid; the prior is ``sum_m q_m(u - a) T^m`` with the Laplacian T across rows.
-
-    ``left`` contains the bands of ``T^m`` for both aliases behind the real and imaginary parts at the nodes.
+    An entry of rows i and j at distance d is the sum of the products of k up to the number of rows before both, and up
+    to that behind both.
     """
-
-    def at(self, u: Tensor, precision: Tensor) -> Tensor:
-        """As in ``SmoothBand``, for a precision (p + 1, 2, U) as of ``PolynomialPrior.precision``."""
-        prior = torch.stack([precision, torch.zeros_like(precision)], dim=-1).flatten(-2).flatten(0, 1)
-        interpolation = interpolation_matrix(self.reach, u, self.left.dtype)[1]
-        right = torch.cat([interpolation.to(prior), prior])
-        return torch.view_as_complex(self._product(right)).flatten(2)
+    row, side = np.arange(count)[:, None], np.arange(-order, order + 1)
+    inside = np.minimum(np.minimum(row, row + side), count - 1 - np.maximum(row, row + side))
+    d, k = np.indices((order + 1, order + 1)).reshape(2, -1)
+    return ((abs(side)[:, None] == d) & (inside[..., None] >= k) & (d + k <= order)).astype(np.float64)
 
 
-def _laplacian_powers(count: int, order: int, device: torch.device) -> Tensor:
-    """Bands (K, 2 p + 1, p + 1) of ``T^0 ... T^p``, ``[k, p + d] = T^m[k, k + d]``, T with mirrored ends."""
-    step = torch.full((count, 3), -1.0, dtype=torch.float64, device=device)  # T[k, k - 1], T[k, k], T[k, k + 1]
-    step[0, 0] = step[-1, 2] = 0.0
-    step[:, 1] = -step[:, 0] - step[:, 2]
-    powers = [torch.zeros(count, 2 * order + 1, dtype=torch.float64, device=device)]
-    powers[0][:, order] = 1.0
-    for _ in range(order):
-        above, here, below = (step[:, 1 + f, None] * powers[-1].roll((-f, f), (0, 1)) for f in (-1, 0, 1))
-        powers.append(above + here + below)
-    return torch.stack(powers, dim=-1)
+def laplacian_bands(count: int, order: int) -> Array:
+    """Bands (2 K, 4 p + 1, 2 (p + 1)) of the powers ``T^0 ... T^p`` of the Laplacian T of K rows, with mirrored ends.
 
-
-@cache
-def prior_diagonals(order: int) -> NDArray[np.float64]:
-    """Factors ((2 p + 1)^2, (p + 1)^2) of products of a prior, as they are added to diagonals -p ... p of bands.
-
-    Row p has the sum of the products at each distance, for all rows of a scene; the rows above what the first rows of
-    the scene lack; the rows below the sums for columns before row p, if row p is the first of the middle rows.
+    There is a matrix of each power for either alias. Unknowns of the aliases alternate.
     """
-    factors = np.zeros((2 * order + 1, 2 * order + 1, order + 1, order + 1))
-    for side in range(-order, order + 1):
-        d, top = abs(side), max(0, -side)
-        factors[order : order + 1 + top, order + side, d, : order + 1 - d] = 1.0
-        for k in range(1, order + 1 - d):
-            factors[top : top + k, order + side, d, k] = -1.0
-    return factors.reshape((2 * order + 1) ** 2, -1)
+    row, side = np.arange(count)[:, None], np.arange(-order, order + 1)
+    # distances to the place of an entry and to its mirror images, at which powers have binomial coefficients
+    distance = np.stack(np.broadcast_arrays(side, 2 * row + side + 1, 2 * (row - count) + side + 1))[..., None]
+    power = np.arange(order + 1)
+    values = ((1 - 2 * (distance % 2)) * comb(2 * power, power + distance)).sum(0)
+    values[(row + side < 0) | (row + side >= count)] = 0.0
+    bands = np.zeros((count, SCALE, SCALE * 2 * order + 1, order + 1, SCALE))
+    for alias in range(SCALE):
+        bands[:, alias, ::SCALE, :, alias] = values
+    return bands.reshape(SCALE * count, SCALE * 2 * order + 1, -1)
 
 
 def normal_matrices(
@@ -375,15 +349,13 @@ class Observation:
             kernels, points = self.kernels, self.kernels.points
             width = max(kernels.taps.shape[-2] - 1, points * order)
             left = normal_matrices(kernels, self.top, self.count, width, self.dtype, self.num_scenes)
-            if points > 1:
-                powers = _laplacian_powers(self.count // points, order, left.device)
-                prior = left.new_zeros(*left.shape[:2], 1, order + 1, points)
-                for alias in range(points):
-                    place = slice(width - points * order, width + points * order + 1, points)
-                    prior[alias : self.count : points, place, 0, :, alias] = powers
-                left = torch.cat([left, prior.flatten(3)], dim=-1)
-            band = SmoothBand if points == 1 else FinerBand
-            self._normal[order] = band(left.to(self.dtype).contiguous(), 2 * kernels.blur_reach)
+            bands = (
+                autoregressive_bands(self.count, order) if points == 1 else laplacian_bands(self.count // points, order)
+            )
+            beside = width - points * order
+            prior = functional.pad(torch.from_numpy(bands), (0, 0, beside, beside, 0, width))
+            left, prior = (values.to(left.device, self.dtype).contiguous() for values in (left, prior))
+            self._normal[order] = SmoothBand(left, prior, points * order, 2 * kernels.blur_reach)
         return self._normal[order]
 
     def weighted(self, weight: Tensor) -> "Observation":

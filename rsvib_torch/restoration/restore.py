@@ -25,7 +25,7 @@ from rsvib_torch.restoration.frame_motion import (
     vibration_to_undo,
     warn_of_restoration,
 )
-from rsvib_torch.restoration.judge import TooLittleInCommonError, judge_stacks, verdict_on_stack
+from rsvib_torch.restoration.judge import TooLittleInCommonError, judge_stacks
 from rsvib_torch.restoration.row_methods import restore_banded, restore_dewarp, restore_richardson_lucy
 
 # Restoration methods. A method is called as
@@ -193,11 +193,10 @@ def _warn_if_worse(frames: PreparedFrames, restored: Tensor, motion: FrameMotion
         return
     moving = [stack for stack, bounds in enumerate(motion.bounds) if any(bounds)]
     judged = judge_stacks(frames, restored, motion, moving, joint=joint, most_pairs=2, columns=160)
-    for stack, pairs in zip(moving, judged, strict=True):
+    for stack, verdict in zip(moving, judged, strict=True):
         # frames that share no scene cannot be compared
-        if not isinstance(pairs, TooLittleInCommonError) and {pair.outcome for pair in pairs} & {"partly", "worse"}:
+        if not isinstance(verdict, TooLittleInCommonError) and verdict.overall in ("partly", "worse"):
             where = f"stack {stack}: " if len(restored) > 1 else ""
-            verdict = verdict_on_stack(pairs, frames.image_timing, restored.device)
             warn_of_restoration(f"{where}{verdict.sentence}")
 
 

@@ -178,7 +178,6 @@ class FixedDewarp(nn.Module):
 
 _SLAB_DEGREE = 3  # of the B-spline across rows
 _KEPT = 2  # central rows of a slab; takes half the time of 1 and costs 0.02 dB (paper camera, noise 0.003)
-_ALIGNED_ROWS = 256  # moved at a time; bounds the memory
 
 
 def _spline_transfer(places: Tensor, frequencies: Tensor) -> Tensor:
@@ -240,13 +239,9 @@ def restore_banded(given: MovingFrames, options: BandedOptions) -> Tensor:
 
     # 2. Fourier transforms of the rows, each moved back by its own mean displacement along it, (B T, H, C, U).
     every_row = torch.arange(H, dtype=torch.float64, device=frames.device).expand(B, T, H)
-    mean = motion.mean_displacement(every_row)[..., 0].flatten()
-    lines = torch.fft.rfft(extend_rows(frames, length)).transpose(-3, -2).flatten(0, 2)
-    aligned = [
-        part * waves(places, -u).to(part.dtype)[:, None]
-        for part, places in zip(lines.split(_ALIGNED_ROWS), mean.split(_ALIGNED_ROWS), strict=True)
-    ]
-    spectra = torch.cat(aligned).unflatten(0, (B * T, H))
+    mean = motion.mean_displacement(every_row)[..., 0].flatten(0, 1)
+    spectra = torch.fft.rfft(extend_rows(frames, length)).transpose(-3, -2).flatten(0, 1)
+    spectra = spectra * shift_phases(mean, length, slice(0, len(u)), spectra.dtype)[:, :, None]
 
     # 3. The Wiener filters of some slabs at a time, at all lags across rows, and the rows that they restore.
     u = u.to(frames.dtype)

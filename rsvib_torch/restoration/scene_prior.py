@@ -5,7 +5,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -145,11 +145,6 @@ def brightness(frames: Tensor) -> Tensor:
     return frames[..., ::8, :].mean((-2, -1))
 
 
-def spread_starts(extent: int, size: int, count: int) -> NDArray[np.int64]:
-    """First rows or columns of ``count`` pieces of ``size`` px, evenly spread over ``extent`` px."""
-    return np.rint(np.linspace(0, extent - size, count)).astype(np.int64)
-
-
 def cut_pieces(images: Tensor, tops: NDArray[np.int64], lefts: NDArray[np.int64], size: tuple[int, int]) -> Tensor:
     """The pieces (..., n, m, *size) of images (..., H, W) from n rows and m columns on."""
     rows, columns = (
@@ -212,7 +207,7 @@ def observed_spectrum(frames: Tensor, motion: FrameMotion, levels: Tensor, lengt
     counts = [-(-2 * (whole - extent) // extent) + 1 for whole, extent in zip(shape, size, strict=True)]
     excess = max(1.0, math.sqrt(counts[0] * counts[1] / _PIECES))
     tops, lefts = (
-        spread_starts(whole, extent, max(1, round(count / excess)))
+        np.rint(np.linspace(0, whole - extent, max(1, round(count / excess)))).astype(np.int64)
         for whole, extent, count in zip(shape, size, counts, strict=True)
     )
     tapers = [constant(taper, extent, dtype=frames.dtype, device=frames.device) for extent in size]
@@ -262,80 +257,46 @@ def fit_prior(frames: Tensor, motion: FrameMotion, levels: Tensor, length: int) 
     return RowPrior(power, torch.stack([first, second]), interpolation).resampled(length // 2 + 1)
 
 
-# rows solved side by side, each slab by itself: results differ by 0.03 dB at most from those of 128 rows
-_SLAB_ROWS = 64
-
-
-@dataclass(frozen=True, eq=False)
-class SampledRows:
-    """Rows of S scenes of M images at F frequencies, in n slabs of each scene, which are scenes of their own."""
-
-    observation: Observation  # of S n slabs
-    spectra: Tensor  # (S n, M, C, R, F), the phase of each row's middle taken off
-    slabs: int  # n
-    energy: float  # squared norm of the taper, times the number of channels; powers are divided by it
-
-    def unexplained(self, precisions: Tensor) -> tuple[Array, Array]:
-        """Residuals of fits to the scenes with each of some priors, frequency by frequency.
-
-        The priors P are products (p + 1, p + 1, P S, F) as from ``RowPrior.precision``, of all scenes one after the
-        other. The results (P, S, F) are the squared residuals of all rows, mean over channels, in units of the noise of
-        one pixel; and the number of rows of a weight above 0, less the degrees of freedom of the fit.
-        """
-        observation, spectra, slabs = self.observation, self.spectra, self.slabs
-        scenes, frequencies = observation.num_scenes // slabs, precisions.shape[-1]
-        shape = (precisions.shape[2] // scenes, scenes, slabs)
-        # 1. One system for each prior, slab and frequency. Those with a prior that is stronger by a factor s give the
-        # degrees of freedom n - d log det A / d log s: a difference quotient.
-        products, step = precisions.repeat_interleave(slabs, 2), 1.2
-        normal = observation.normal(len(products) - 1).in_windows([slice(0, observation.count)])
-        system = normal.at(observation.u, torch.cat([products, step * products], 2))
-        factor, stronger = factor_banded(system, observation.count).split(2)
-        growth = (stronger.log_determinant() - factor.log_determinant()).view(*shape, frequencies)
-        freedom = observation.count * slabs - growth.sum(2) / math.log(step)
-        # 2. The residuals of the rows with each prior, which are channels of the scenes that are fitted.
-        whole = slice(0, frequencies)
-        fitted = factor.solve(observation.adjoint(spectra, whole).flatten(2).repeat(1, 1, shape[0]))
-        fitted = fitted.unflatten(2, (shape[0], observation.num_scenes, frequencies))
-        predicted = observation.forward(fitted.flatten(1, 2), whole).unflatten(2, (-1, shape[0]))
-        weight = observation.kernels.weight.unflatten(0, (len(spectra), -1))  # (S n, M, R)
-        residual = squared_modulus(spectra[:, :, :, None] - predicted)
-        power = torch.einsum("smr,smcprf->psf", weight.to(residual.dtype), residual) / self.energy
-        counted = (weight > 0).double().sum((1, 2)).view(scenes, slabs).sum(1)
-        of_scenes, rest = tables(power.unflatten(1, (scenes, slabs)).sum(2), counted[:, None] - freedom)
-        return of_scenes, rest
-
-
 @torch.no_grad()
-def sample_rows(images: Tensor, kernels: RowKernels, chosen: NDArray[np.int64]) -> SampledRows:
-    """Spectra of tapered rows of images (S, M, C, R, W) at frequencies (F,), cycles in W px, in slabs of equal height.
+def unexplained(
+    images: Tensor, kernels: RowKernels, chosen: NDArray[np.int64], precisions: Tensor
+) -> tuple[Array, Array]:
+    """Residuals of fits to S scenes of images (S, M, C, R, W) with each of some priors, frequency by frequency.
 
-    ``kernels`` are those of the rows of S M images. Rows beyond the last slab are not used.
+    ``kernels`` are those of the rows of S M images; the frequencies ``chosen`` (F,) are in cycles in W px. The priors P
+    are products (p + 1, p + 1, P S, F) as from ``RowPrior.precision``, of all scenes one after the other. The results
+    (P, S, F) are the squared residuals of all rows, mean over channels, in units of the noise of one pixel; and the
+    number of rows of a weight above 0, less the degrees of freedom of the fit.
     """
-    scenes, members, channels = images.shape[:3]
-    slabs = max(1, images.shape[-2] // _SLAB_ROWS)
-    height, width = images.shape[-2] // slabs, images.shape[-1]
-    images, kernels = images[..., : slabs * height, :], kernels.rows(0, slabs * height)
-    # spectra of the rows, minus the mean of the image, with the phase of each row's middle taken off
+    scenes, members, channels, height, width = images.shape
+    # 1. Spectra of the tapered rows, minus the mean of the image, with the phase of each row's middle taken off.
     taper = np.hanning(width + 2)[1:-1]
     u = torch.from_numpy(chosen / width)
     deviations = (images - images.mean((-2, -1), keepdim=True)) * torch.from_numpy(taper).to(images)
     spectra = torch.fft.rfft(deviations)[..., torch.from_numpy(chosen).to(images.device)]
     phases = waves(-kernels.middle, u.to(images.device)).to(spectra.dtype)
     spectra = spectra * phases.unflatten(0, (scenes, members))[:, :, None]
-
-    def in_slabs(values: Tensor) -> Tensor:
-        """(S M, n height, ...) as (S n M, height, ...)."""
-        return values.unflatten(1, (slabs, height)).unflatten(0, (scenes, members)).transpose(1, 2).flatten(0, 2)
-
-    # coefficients of a slab count from its first row
-    first = kernels.first - height * (torch.arange(slabs * height, device=images.device) // height)
-    values = (first, kernels.taps, torch.zeros_like(kernels.middle), kernels.along, kernels.weight)
-    first, taps, middle, along, weight = map(in_slabs, values)
-    of_slabs = RowKernels(first, taps, middle, along, weight)
-    observation = Observation(of_slabs, height, width, images.dtype, scenes * slabs).at_frequencies(u, width)
-    spectra = spectra.unflatten(3, (slabs, height)).movedim(3, 1).flatten(0, 1)
-    return SampledRows(observation, spectra, slabs, channels * float((taper**2).sum()))
+    centred = replace(kernels, middle=torch.zeros_like(kernels.middle))
+    observation = Observation(centred, height, width, images.dtype, scenes).at_frequencies(u, width)
+    # 2. One system for each prior and frequency. Those with a prior that is stronger by a factor s give the degrees of
+    # freedom n - d log det A / d log s: a difference quotient.
+    shape, step = (precisions.shape[2] // scenes, scenes, len(u)), 1.2
+    normal = observation.normal(len(precisions) - 1).in_windows([slice(0, observation.count)])
+    system = normal.at(u, torch.cat([precisions, step * precisions], 2))
+    factor, stronger = factor_banded(system, observation.count).split(2)
+    growth = (stronger.log_determinant() - factor.log_determinant()).view(shape)
+    freedom = observation.count - growth / math.log(step)
+    # 3. The residuals of the rows with each prior, which are channels of the scenes that are fitted.
+    whole = slice(0, len(u))
+    fitted = factor.solve(observation.adjoint(spectra, whole).flatten(2).repeat(1, 1, shape[0])).unflatten(2, shape)
+    predicted = observation.forward(fitted.flatten(1, 2), whole).unflatten(2, (-1, shape[0]))
+    weight = kernels.weight.unflatten(0, (scenes, members))
+    residual = squared_modulus(spectra[:, :, :, None] - predicted)
+    energy = channels * float((taper**2).sum())
+    power = torch.einsum("smr,smcprf->psf", weight.to(residual.dtype), residual) / energy
+    counted = (weight > 0).double().sum((1, 2))
+    unexplained_power, rest = tables(power, counted[:, None] - freedom)
+    return unexplained_power, rest
 
 
 _STRENGTHS = np.array([1.0, 2.0, 4.0, 8.0, 16.0])  # factors on the prior
@@ -362,7 +323,6 @@ def prior_strengths(
     rows, frequencies = min(height, _ROWS), min(_FREQUENCIES, width // 4)
     top = (height - rows) // 2
     chosen = np.linspace(0.02 * width, width // 2, frequencies, dtype=np.float32).astype(np.int64)
-    sample = sample_rows(images[..., top : top + rows, :], kernels.rows(top, rows), chosen)
     place = torch.from_numpy(np.rint(chosen / width * 2 * (prior.power.shape[-1] - 1)).astype(np.int64))
     scenes, members, number = *prior.interpolation_power.shape[:2], len(_STRENGTHS)
     at = RowPrior(*(values[..., place.to(values.device)] for values in vars(prior).values()))
@@ -370,7 +330,7 @@ def prior_strengths(
     of_all = at.of(stacks.repeat(number), frames)
     strength = torch.from_numpy(_STRENGTHS.repeat(scenes)[:, None]).to(noise_power)
     precisions = of_all.precision(noise_power.repeat(number, 1), strength, blur_reach.repeat(number, 1))
-    power, rest = sample.unexplained(precisions)
+    power, rest = unexplained(images[..., top : top + rows, :], kernels.rows(top, rows), chosen, precisions)
     # 2. ``n |r|^2 / (n - freedom)^2`` of Craven and Wahba (1979) estimates the squared error of predicting a pixel from
     # all others. The sum over the frequencies is dominated by those with the largest errors; the geometric mean gives
     # all the same weight. The weaker of the two selected priors is used: with the sum alone, five of 124 restorations

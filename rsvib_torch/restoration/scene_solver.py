@@ -86,7 +86,7 @@ class SceneSolver:
         blurred, scenes = observation.kernels.blurred, observation.num_scenes
 
         # Chunks of the frequencies; all at a time if their factors are kept.
-        most = frequencies if keep else max(1, most_values(device) // (scenes * rows * (2 * normal.width + 1)))
+        most = frequencies if keep else max(1, most_values(device) // (scenes * rows * normal.left.shape[1]))
         rounds = -(-frequencies // most)
         chunk = -(-frequencies // (8 * rounds)) * 8  # rows begin at full cache lines
         self._parts = runs(frequencies, min(chunk, frequencies))
@@ -102,11 +102,6 @@ class SceneSolver:
         if nodes is not None:
             systems = self._normal.at(self.u[nodes], precision[..., nodes])
             self._interpolated = InterpolatedFactors.of(systems, nodes, self._num_rows)
-
-    @property
-    def interpolates(self) -> bool:
-        """Whether the factors are interpolated between some frequencies."""
-        return self._interpolated is not None
 
     @cached_property
     def _factors(self) -> list[BandedFactor]:
@@ -159,16 +154,10 @@ class SceneSolver:
             solution = solve_halves(system, right)
             return join_windows(solution.unflatten(-1, (scenes, len(windows), -1)), windows)
 
+        numbers = range(len(self._parts))
         if differentiates:
-            return torch.cat([solve(number) for number in range(len(self._parts))], dim=-1)
-        channels = given.shape[-3 if given.ndim == 5 else 1]
-        coefficients: Tensor = given.new_empty(self.observation.count, channels, scenes, len(self.u))
-
-        def fill_part(number: int) -> None:
-            coefficients[..., self._parts[number]] = solve(number)
-
-        in_parallel(fill_part, range(len(self._parts)), given.device, at_most=MOST_THREADS)
-        return coefficients
+            return torch.cat([solve(number) for number in numbers], dim=-1)
+        return torch.cat(in_parallel(solve, numbers, given.device, at_most=MOST_THREADS), dim=-1)
 
     def predict(self, coefficients: Tensor) -> Tensor:
         """Noiseless frames (N, M, C, R, L) of the scenes, ``K c``."""
@@ -188,10 +177,15 @@ class SceneProblem:
     observation: Observation  # observation operator of the frames
     precision: Tensor  # precision of the row prior, products as from ``RowPrior.precision``
     level: Tensor  # (N,) standard deviation of the noise of data of weight 1
+    mixing: Tensor | None = None  # (N, N) orthonormal; values that are measured are the ``mixed`` ones
 
     def solver(self, *, keep: bool = False) -> SceneSolver:
         """The solver for complete data; ``keep`` its factors, for solving several times."""
         return SceneSolver(self.observation, self.precision, keep=keep)
+
+    def mixed(self, values: Tensor) -> Tensor:
+        """Measured values (N, ...) from those of the scenes."""
+        return values if self.mixing is None else torch.einsum("nc,n...->c...", self.mixing, values)
 
 
 # px along the row from its middle; above, the boundary extension is filled: a larger blur mixes it into the frame
@@ -231,27 +225,37 @@ def measured_values(along: Tensor, unknown: Tensor | None, shape: torch.Size, wi
 
 
 def with_missing_values(
-    problem: SceneProblem, measured: Tensor, floor: Tensor | None = None, *, iterations: int = 8
+    problem: SceneProblem,
+    solver: SceneSolver,
+    measured: Tensor,
+    floor: Tensor | None = None,
+    *,
+    iterations: int = 8,
+    accuracy: float = 0.05,
 ) -> SceneProblem:
-    """The problem with missing values replaced by what the solution for all other data predicts.
+    """The problem, with its solver, with missing values replaced by what the solution for all other data predicts.
 
     The missing values x solve ``x = (K c(x))`` where they are, with the solution c(x) for the filled data. Conjugate
     gradients, each step of which is one fast solution, start from the solution of the most complete frames, until the
-    residual is 0.05 times the noise level. The lower bounds ``floor`` (N, M, C, R, L) of saturated pixels are held
-    approximately, by two rounds of an active set: at the beginning of each, values that are predicted below their bound
-    are set to it, and count as ``measured`` (N, M, C, R, L) from then on.
+    residual is ``accuracy`` times the noise level. The lower bounds ``floor`` (N, M, C, R, L) of saturated pixels are
+    held approximately, by two rounds of an active set: at the beginning of each, values that are predicted below their
+    bound are set to it, and count as ``measured`` (N, M, C or 1, R, L) from then on. Channels are filled independently.
     """
-    data, solver = problem.data, problem.solver(keep=True)
+    data, mixing = problem.mixed(problem.data), problem.mixing
 
     # The inner product of conjugate gradients weights rows as the least-squares problem does.
     weight = problem.observation.kernels.weight.unflatten(0, data.shape[:2])
     row_weight = weight.to(data.dtype)[:, :, None, :, None]
+    together = (1, 3, 4) if mixing is None else (0, 1, 3, 4)
 
     def dot(first: Tensor, second: Tensor) -> Tensor:
-        return (row_weight * first * second).sum((1, 2, 3, 4), keepdim=True)
+        return (row_weight * first * second).sum(together, keepdim=True)
+
+    def of_scenes(values: Tensor) -> Tensor:
+        return values if mixing is None else torch.einsum("nc,c...->n...", mixing, values)
 
     def prediction(solver: SceneSolver, values: Tensor) -> Tensor:
-        return solver.predict(solver.fit(values))
+        return problem.mixed(solver.predict(solver.fit(of_scenes(values))))
 
     def residual_of(values: Tensor, missing: Tensor) -> Tensor:
         return torch.where(missing, values - prediction(solver, values), 0.0)
@@ -273,7 +277,7 @@ def with_missing_values(
             data, measured = torch.where(low, floor, data), measured | low
         # Conjugate gradients for the others, until the residual of each scene is small beside the noise.
         missing = ~measured
-        enough = (0.05 * problem.level[:, None, None, None, None]).square() * dot(missing.to(data.dtype), missing)
+        enough = (accuracy * problem.level[:, None, None, None, None]).square() * dot(missing.to(data.dtype), missing)
         residual = -residual_of(data, missing)
         direction, energy = residual, dot(residual, residual)
         for _ in range(iterations // rounds):
@@ -286,7 +290,7 @@ def with_missing_values(
             residual = residual - length * product
             before, energy = energy, dot(residual, residual)
             direction = residual + torch.where(inexact, energy / before, 0.0) * direction
-    return replace(problem, data=data)
+    return replace(problem, data=of_scenes(data))
 
 
 def with_extension(problem: SceneProblem, width: int) -> SceneProblem:
@@ -312,5 +316,6 @@ def with_extension(problem: SceneProblem, width: int) -> SceneProblem:
     )
     # the extension is hardly mixed into the frame by a blur below 1 px, on the finer grid: more iterations gain 0.01 dB
     iterations = 40 if blur_reach > FILLED_BLUR_REACH else 6
-    solved = with_missing_values(joined, measured.expand_as(joined.data), iterations=iterations)
+    missing = measured.expand_as(joined.data)
+    solved = with_missing_values(joined, joined.solver(keep=True), missing, iterations=iterations)
     return replace(problem, data=torch.cat([data[..., :width], solved.data[..., gap]], dim=-1))

@@ -24,8 +24,8 @@ from rsvib_torch.tracking.window_fit import ROUNDS, WindowFit
 # rms, of one that a person crosses by 0.07 and 0.16 px; with twice the pairs, or 256 corners, by as much
 _PAIRS, _CORNERS = 2, 96
 _LONGEST = 12  # frame periods, over which frames are compared
-# frames, after which the scene is looked at for repetitions, which takes 20 ms. A fence, whose path corners do not show,
-# shook by 0.79 and 0.90 px instead of 0.30 and 0.86 px
+# frames, after which the scene is looked at for repetitions, which takes 20 ms. A fence, whose path is not known from
+# corners, shook by 0.79 and 0.90 px instead of 0.30 and 0.86 px
 _LOOKED_AT = 32
 
 _zeros = partial(np.zeros, 2)

@@ -263,7 +263,7 @@ SCENES = {
     [
         ("buildings", 20, 0.02, 2, False, -0.1, 0.3),
         ("soft", 100, 0.05, 2, True, 1.0, 0.3),
-        ("dense texture", 20, 0.001, 2, True, -0.1, 0.3),
+        ("dense texture", 20, 0.001, 2, True, -0.1, 0.35),
     ],
 )
 def test_estimated_strength_is_close_to_the_best(name, rows, noise, given, joint, least, within):

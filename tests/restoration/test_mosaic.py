@@ -14,8 +14,8 @@ from rsvib_torch.frames.pixels import colour_frames, is_mosaic
 from rsvib_torch.restoration import RestorationWarning
 from rsvib_torch.restoration.finer_grid import PolynomialPrior
 from rsvib_torch.restoration.frame_motion import frame_motion
-from rsvib_torch.restoration.mosaic_scene import MosaicSolver
 from rsvib_torch.restoration.observation import Observation, RowKernels
+from rsvib_torch.restoration.scene_solver import SceneProblem, with_missing_values
 
 SIZE, MARGIN, NOISE = 72, 24, 0.003
 
@@ -142,23 +142,24 @@ def test_missing_and_saturated_pixels(scene, frames):
 
 
 def test_gradient_of_the_least_squares_solution():
-    """Of conjugate gradients with weights that couple the colours."""
+    """Of conjugate gradients for missing values of colours, which couple the components."""
     generator = torch.Generator().manual_seed(1)
     motion = frame_motion(VIBRATION.expanded(1), TIMING.in_row_order(), 2, 24)
     displacement, node_weights = motion.exposures
-    kernels = RowKernels.of_rows(displacement[0], node_weights, torch.ones(2), 24, points=2)
-    observation = Observation(kernels, 24, 32, torch.float64)
+    kernels = RowKernels.of_rows(displacement[0].repeat(3, 1, 1, 1), node_weights, torch.ones(6), 24, points=2)
+    observation = Observation(kernels, 24, 32, torch.float64, 3)
     prior = PolynomialPrior(torch.ones(7, 7, dtype=torch.float64), 32)
-    precisions = [
-        prior.precision(torch.tensor(1e-4 * factor), blur_reach=kernels.blur_reach) for factor in (1.0, 4.0, 4.0)
-    ]
-    weights = (torch.rand(2, 3, 24, 32, generator=generator, dtype=torch.float64) < 0.4).double()
-    solver = MosaicSolver(observation, weights, precisions)
-    check_gradient(
-        lambda data: solver.image(solver.fit(data, iterations=12)).square().mean(),
-        torch.rand(2, 3, 24, 32, generator=generator, dtype=torch.float64),
-        rel=1e-3,
-    )
+    precision = torch.cat([prior.precision(torch.tensor(1e-4 * factor), blur_reach=0.1) for factor in (1, 4, 4)], 2)
+    mixing = torch.linalg.qr(torch.rand(3, 3, generator=generator, dtype=torch.float64))[0]
+    measured = torch.rand(3, 2, 1, 24, 32, generator=generator) < 0.4
+
+    def energy(data):
+        problem = SceneProblem(data, observation, precision, torch.full((3,), 0.01), mixing)
+        solver = problem.solver(keep=True)
+        filled = with_missing_values(problem, solver, measured, iterations=12)
+        return solver.image(solver.fit(filled.data)).square().mean()
+
+    check_gradient(energy, torch.rand(3, 2, 1, 24, 32, generator=generator, dtype=torch.float64), rel=1e-3)
 
 
 def test_detection_in_raw_frames():
