@@ -117,8 +117,8 @@ def rows_of(unexplained=0.0, correlated=0.0, differential=0.0, measured=1.0, blu
         ({"blur": (4.0, 0.5, 0.05)}, [["blur_contradicts_exposure"]] * 2),
         ({"blur": (4.0, 0.8, 0.05)}, [[], []]),
         ({"blur": (4.0, 0.5, 0.0005)}, [[], []]),
-        ({"blur": (400.0, 50.0, 0.00002)}, [["blur_contradicts_exposure"]] * 2),  # stated 20 times too short
-        ({"blur": (0.1, 0.1, 0.0005)}, [[], []]),  # the expected difference is too small to be missed
+        ({"blur": (900.0, 150.0, 0.00002)}, [["blur_contradicts_exposure"]] * 2),  # stated 30 times too short
+        ({"blur": (0.1, 1.4, 0.0005)}, [[], []]),  # the expected difference is too small to be missed
         ({"blur": (-0.2, 0.1, 0.05)}, [["blur_contradicts_exposure"]] * 2),
         ({"blur": (-0.4, 0.1, 0.05)}, [[], []]),  # no exposure time has a negative ratio
         ({"blur": (0.3, 0.01, 0.3)}, [[], []]),  # the second order does not describe so much blur
