@@ -82,10 +82,24 @@ def tensor(values: Array) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(values))
 
 
+_MANY = 2048  # values; PyTorch takes 6 ns each and 5 us for a call, NumPy 17 ns each
+
+
+def cos_sin(angle: Array) -> tuple[Array, Array]:
+    """Cosine and sine of float64 angles in rad; PyTorch takes a third of the time of NumPy for many, 5 us for one."""
+    if angle.size < _MANY:
+        return np.cos(angle), np.sin(angle)
+    cosine, sine = np.empty_like(angle), np.empty_like(angle)
+    values = torch.from_numpy(angle)
+    torch.cos(values, out=torch.from_numpy(cosine))
+    torch.sin(values, out=torch.from_numpy(sine))
+    return cosine, sine
+
+
 def unit_wave(angle: Array) -> Array:
     """``exp(i angle)`` of float64 angles in rad."""
     wave: Array = np.empty(angle.shape, np.complex128)
-    wave.real, wave.imag = np.cos(angle), np.sin(angle)
+    wave.real, wave.imag = cos_sin(angle)
     return wave
 
 

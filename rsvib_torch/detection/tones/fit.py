@@ -17,6 +17,7 @@ from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.numerics.tables import (
     Array,
+    cos_sin,
     select_stacks,
     split_axis,
     take_stacks,
@@ -128,7 +129,7 @@ def _jacobian_of_tones(smearing_times: Array, time: Array, tones: Array) -> Arra
     )
     turn = (2 * math.pi) * attenuation
     angle = (2 * math.pi * frequencies) * time
-    cos, sin = np.cos(angle), np.sin(angle)
+    cos, sin = cos_sin(angle)
     by_frequency = cos * (slope * real - time * (turn * imaginary)) - sin * (slope * imaginary + time * (turn * real))
     by_tones = np.stack([attenuation * cos, -attenuation * sin, by_frequency], -1)
     return by_tones.reshape(*angle.shape[:-1], -1)
