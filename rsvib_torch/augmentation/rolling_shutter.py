@@ -4,7 +4,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md), with
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NoReturn
 
@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.checks.arguments import channels_appear_last, check_tensor, checks_arguments
-from rsvib_torch.checks.values import check_choice, check_number, check_whole_number
+from rsvib_torch.checks.values import check_choice, check_number, check_whole_number, described
 from rsvib_torch.execution.parallel import full_precision
 from rsvib_torch.files.reading import Table
 from rsvib_torch.frames.prepare import frames_from_row_order, frames_to_row_order
@@ -219,7 +219,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         for name, of_turn in (("roll", roll), ("zoom", zoom))[: 2 if zoom is not None else int(roll is not None)]:
             if isinstance(of_turn, Sequence) and any(isinstance(part, Sequence) for part in of_turn):
                 raise TypeError(f"{name} must be a number or (low, high), got {quoted(of_turn)}")
-            turns += _axis_ranges(name, of_turn or 0.0, at_least=0.0)[:1]
+            turns += _axis_ranges(name, 0.0 if of_turn is None else of_turn, at_least=0.0)[:1]
         self.flags = {"image_motion": _axis_ranges("image_motion", image_motion), "exposure_rows": exposures}
         self.flags |= {"amplitude": _axis_ranges("amplitude", amplitude, at_least=0.0) + turns}
         for name, drawn, lowest in (("frequency", frequency, 0.0), ("phase", phase, -math.inf)):
@@ -231,6 +231,8 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         """Record images (H, W), (C, H, W) or (B, C, H, W); the other arguments are those of Kornia's augmentations."""
         if not torch.compiler.is_compiling():
             check_tensor("input", input)
+        if params is not None and not isinstance(params, Mapping):
+            raise TypeError(f"params must be those of a former call, got {described(params)}")
         return super().forward(input, params, **kwargs)
 
     @checks_arguments

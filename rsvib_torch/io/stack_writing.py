@@ -15,6 +15,7 @@ from rsvib_torch.frames.full_scale import check_dtype, frames_to_counts, known_f
 from rsvib_torch.io.formats import FORMATS, StackFormat, target_format
 from rsvib_torch.io.stack_info import DIFFERENT, StackInfo, split_range
 from rsvib_torch.numerics.tables import Array
+from rsvib_torch.text import quoted
 
 
 def stack_files(path: PathLike) -> list[Path]:
@@ -45,7 +46,10 @@ def _planned(shape: tuple[int, ...], dtype: str | None, full_scale: float | None
     """A stack to write, with what ``like`` states except times that are not exact."""
     if len(shape) not in (3, 4) or min(shape) < 1:
         raise ValueError(f"frames must have shape (T, H, W) or (T, C, H, W), got {tuple(shape)}")
-    kind = np.dtype(dtype or np.float32)
+    try:
+        kind = np.dtype(dtype or np.float32)
+    except TypeError:
+        raise TypeError(f"dtype must be a data type of NumPy such as 'uint16', got {quoted(dtype)}") from None
     full_scale = known_full_scale(kind) if kind.kind == "f" or full_scale is None else full_scale
     info = StackInfo(tuple(shape), kind.name, full_scale)
     if like is None:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import check_broadcast, checked_methods
-from rsvib_torch.checks.values import check_number, check_whole_number, read_json
+from rsvib_torch.checks.values import check_choice, check_number, check_whole_number, read_json
 from rsvib_torch.text import quoted
 
 _NEWTON_STEPS = 8  # of the inverse of the distortion; quadratic convergence, 1e-13 after 6 steps for 60 degrees
@@ -68,6 +68,7 @@ class Camera:
 
     def __post_init__(self) -> None:
         check_number("focal_length", self.focal_length, at_least=1.0, at_most=1e9)
+        check_choice("fisheye", self.fisheye, (True, False))
         for name, count in (("principal_point", 2), ("distortion", 4 if self.fisheye else 5)):
             values = (0.0,) * count if getattr(self, name) == () else getattr(self, name)
             if isinstance(values, str) or not isinstance(values, Sequence) or len(values) != count:

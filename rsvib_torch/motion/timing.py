@@ -245,6 +245,7 @@ class SensorTiming:
         A ``TimingWarning`` states intervals between frames that are all far from the frame period.
         """
         check_whole_number("num_rows", num_rows, at_least=1)
+        check_whole_number("num_frames", num_frames, at_least=1)
         starts = self.frame_starts(num_frames)
         step, span = float(starts.diff().median()), float(starts[-1] - starts[0])
         if span <= self.row_time * max(MAX_SPAN, _MAX_BLANKING * num_frames * num_rows):
