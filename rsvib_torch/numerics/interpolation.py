@@ -12,7 +12,7 @@ from scipy import fft, special
 from torch import Tensor
 
 from rsvib_torch.execution.parallel import runs
-from rsvib_torch.numerics.tables import Array, table, tensor
+from rsvib_torch.numerics.tables import Array, constant, table, tensor
 
 
 def bspline_weights(fraction: Tensor, degree: int, derivative: int = 0) -> Tensor:
@@ -236,6 +236,18 @@ def fourier_sums(times: Array, values: Array, grid: tuple[float, int, int]) -> A
     return sums.reshape(*values.shape[:-2], count)
 
 
+def _mirrored_ends(width: int, extra: int) -> Array:
+    """Pixels that are mirrored at the right end, then those at the left end, of rows that are extended by ``extra``."""
+    steps = np.arange(1, extra + 1)
+    return np.concatenate([(width - 1 - steps).clip(0), steps[::-1].clip(None, width - 1)])
+
+
+def _blend(extra: int, hold: float) -> Array:
+    """Share of the right end in the extension."""
+    progress = ((np.arange(1, extra + 1) / (extra + 1) - hold) / (1 - 2 * hold)).clip(0, 1)
+    return 0.5 + 0.5 * np.cos(np.pi * progress)
+
+
 def extend_rows(images: Tensor, length: int, hold: float = 0.25) -> Tensor:
     """Extend rows (..., W) at their right end to ``length``, so that they close smoothly into a period.
 
@@ -249,12 +261,10 @@ def extend_rows(images: Tensor, length: int, hold: float = 0.25) -> Tensor:
     extra = length - width
     if extra <= 0:
         return images
-    steps = torch.arange(1, extra + 1, device=images.device)
-    progress = ((steps.double() / (extra + 1) - hold) / (1 - 2 * hold)).clamp(0.0, 1.0)
-    share = (0.5 + 0.5 * torch.cos(math.pi * progress)).to(images.dtype)  # of the right end
+    sources = constant(_mirrored_ends, width, extra, dtype=torch.int64, device=images.device)
+    share = constant(_blend, extra, hold, dtype=images.dtype, device=images.device)
     # twice the end minus what is mirrored, of both ends; index_select is four times as fast as an index
-    after = images.index_select(-1, (width - 1 - steps).clamp(min=0))
-    before = images.index_select(-1, steps.flip(0).clamp(max=width - 1))
+    after, before = images.index_select(-1, sources).chunk(2, -1)
     ends = torch.lerp(images[..., :1], images[..., -1:], share)
     return torch.cat([images, 2 * ends - torch.lerp(before, after, share)], dim=-1)
 

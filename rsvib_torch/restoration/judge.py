@@ -160,7 +160,7 @@ def judge_prepared(
     (verdict,) = judge_stacks(frames, restored, motion, joint=joint, most_pairs=most_pairs)
     if isinstance(verdict, TooLittleInCommonError):
         raise verdict
-    return verdict
+    return verdict.to(restored.device)
 
 
 @torch.no_grad()
@@ -174,7 +174,7 @@ def judge_stacks(
     most_pairs: int | None = None,
     columns: int | None = None,
 ) -> list[RestorationVerdict | TooLittleInCommonError]:
-    """Verdicts on some stacks of a batch, or errors if two frames have too little in common.
+    """Verdicts on some stacks of a batch, on the CPU, or errors if two frames have too little in common.
 
     Restored frames (B, T, C, H, W), or (B, 1, C, H, W), are in row order. Only the ``columns`` with the most detail are
     used.
@@ -217,17 +217,17 @@ def judge_stacks(
                 )
             )
         else:
-            verdicts.append(_joined([judged[number] for number in of_stack], frames.image_timing, restored.device))
+            verdicts.append(_joined([judged[number] for number in of_stack], frames.image_timing))
     return verdicts
 
 
-def _joined(pairs: list[PairVerdict], timing: SensorTiming, device: torch.device) -> RestorationVerdict:
+def _joined(pairs: list[PairVerdict], timing: SensorTiming) -> RestorationVerdict:
     """One verdict from those on all pairs of a stack, in image axes."""
     levels, displacements, outcomes, reasons = zip(*pairs, strict=True)
-    moved = torch.from_numpy(np.stack(displacements, 1)).to(device)  # (3, P, 2)
+    moved = torch.from_numpy(np.stack(displacements, 1))  # (3, P, 2)
     moved = moved.flip(-1) if timing.scan_axis == -1 else moved
     return RestorationVerdict(
-        **dict(zip(LEVELS, torch.from_numpy(np.stack(levels, 1)).to(device), strict=True)),
+        **dict(zip(LEVELS, torch.from_numpy(np.stack(levels, 1)), strict=True)),
         **dict(zip(DISPLACEMENTS, moved, strict=True)),
         outcome=outcomes,
         findings=tuple(reasons_from_row_order(of_pair, timing) for of_pair in reasons),
