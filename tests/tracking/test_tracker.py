@@ -424,6 +424,20 @@ def test_the_line_of_a_steady_image_has_always_as_many_places():
     assert np.ptp(shifts[31:], 0).max() < 1e-6
 
 
+@pytest.mark.parametrize("repeats", [True, False])
+def test_the_path_before_a_scene_that_repeats_itself_is_not_known(repeats):
+    """Corners do not show by how many slats of a fence the camera moves; a drawn scene is followed."""
+    scene = 255 * draw_scene(SIZE, SIZE + 40, seed=6)
+    if repeats:
+        scene = np.broadcast_to(80.0 + 100.0 * (np.arange(SIZE + 40) % 20 < 8), (SIZE, SIZE + 40))
+    live = LivePath.started(TIMING)
+    for index in range(4):
+        grey = np.ascontiguousarray(scene[:, 3 * index : 3 * index + SIZE]).astype(np.uint8)
+        live = live.followed(grey, index / RATE, rsv.Vibration([0.0, 0.0], 0.0, 0.0))
+    assert bool(live.pairs) != repeats
+    np.testing.assert_allclose(live.place, [0.0 if repeats else -9.0, 0.0], atol=0.5)
+
+
 def test_a_steady_image_does_not_jump_where_its_path_is_lost(steady):
     """It jumped back by its whole displacement, and the video shook more than as taken."""
 
