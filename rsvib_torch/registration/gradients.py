@@ -20,6 +20,7 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from threading import get_ident
 
 import torch
 from torch import Tensor
@@ -99,10 +100,14 @@ def row_gradients(
     inner = functional.pad(inner_columns(width, shift, detail.real), (0, length - width))
     parts = chunks(count, 4 * length * batch * (4 + frames), visible.device, multiple=BLOCK)
     regressors = 3 if factors is None else 1 + factors(slice(0, 1)).shape[-1]
+    images_of_row = regressors + (1 if frames == 2 else frames)
+    memory: dict[int, Tensor] = {}  # of each thread, used again
 
     def pixels(part: slice) -> _Rows:
         of_scene, part_visible = detail[:, part].contiguous(), visible[:, :, part]
-        planes = inner.new_empty(batch, of_scene.shape[1], regressors + different.shape[1], length)
+        if get_ident() not in memory:
+            memory[get_ident()] = inner.new_empty(batch, parts[0].stop, images_of_row, length)
+        planes = memory[get_ident()][:, : of_scene.shape[1]]
         planes[:, :, 0], planes[:, :, 1] = (
             torch.fft.irfft(one, n=length) for one in (of_scene * along, across[:, part])
         )
