@@ -91,9 +91,7 @@ def refine(
         cleaned = refined.frames.without(pattern)
         from_fit = take_stacks([refined.fit], index)
         again = _rounds(cleaned.stacks(index), intervals, from_fit, tones, search_round=0)
-        place = np.arange(len(found))
-        place[index] = len(found) + np.arange(len(index))
-        refined = replace(_taken([refined, again], place), frames=cleaned)
+        refined = replace(_with_stacks(refined, again, index), frames=cleaned)
     # 3. A long exposure can make the start choose the wrong side of a blind frequency: the other side is tried as well,
     # one axis after the other.
     blurred = frames.differently_blurred(motion_of_fit(shrunk(start, intervals), device))
@@ -154,6 +152,13 @@ def _taken(results: Sequence[FittedRows], index: Array) -> FittedRows:
     return take_stacks(roomy, index)
 
 
+def _with_stacks(first: FittedRows, second: FittedRows, index: Array) -> FittedRows:
+    """The result with those of other rounds in place of the stacks ``index``."""
+    place = np.arange(len(first.unknown))
+    place[index] = len(place) + np.arange(len(index))
+    return _taken([first, second], place)
+
+
 class Refinement:
     """State of the rounds that refine the motion of B stacks, from a fit to the offsets of row bands.
 
@@ -171,8 +176,8 @@ class Refinement:
         start: ToneFit,
         tones: int | None,
         *,
-        may_abandon: bool = False,
-        search_round: int = 1,
+        may_abandon: bool,
+        search_round: int,
     ) -> None:
         self.frames, self.fit = frames, start  # the fit of the last round
         # the fits around whose motions the next round measures and the last one measured
@@ -393,7 +398,5 @@ def _is_nearly_blind(fit: ToneFit, intervals: Array) -> Array:
 def with_better(first: FittedRows, second: FittedRows, index: Array) -> FittedRows:
     """The result with another one of the stacks ``index`` where its residual in the typical row is smaller or known."""
     sizes = typical_size(first.measurements, first.fit)[index], typical_size(second.measurements, second.fit)
-    better = sizes[1] < without_nan(sizes[0], np.inf)
-    place = np.arange(len(first.unknown))
-    place[index[better]] = len(place) + np.flatnonzero(better)
-    return replace(_taken([first, second], place), abandoned=first.abandoned)
+    better = np.flatnonzero(sizes[1] < without_nan(sizes[0], np.inf))
+    return replace(_with_stacks(first, take_stacks([second], better), index[better]), abandoned=first.abandoned)

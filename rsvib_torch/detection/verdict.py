@@ -338,13 +338,13 @@ def exposure_reasons(timing: RowTiming, ratio: float, std: float, size: float | 
     """Reasons against all axes from the difference of the blur between frames.
 
     Its ratio to the expected one is the square of the ratio of the exposure times (docs/verdicts.md). A stated exposure
-    that is far too short expects nearly no blur, so that what counts is the size of the measured difference: rows that
-    move slowly are compared at the same part of a pixel, and errors of interpolation seemed to be a blur of 0.009 of
-    the detail in 5 of 200 recordings with sizes below 1e-4. Sizes above 0.25 of the detail are beyond the second order,
-    with which ratios of 0.5 to 1.5 were measured for sizes of 0.05 and more. Negative ratios are caused by another
-    error, because no exposure time gives them. H.264 predicts frames from others and lowers the ratio, from 1.06 to
-    0.94, 0.61 and 0.23 with CRF 10, 17 and 23: without a size, frames are those of a video, and only a large ratio is a
-    reason.
+    that is far too short expects nearly no blur, so that what counts is the size of the measured difference: rows
+    that move slowly are compared at the same part of a pixel, and errors of interpolation seemed to be a blur of
+    0.004 to 0.009 of the detail in 5 of 27 recordings with slow tones or roll and sizes below 1e-4. Sizes above
+    0.25 of the detail are beyond the second order, with which ratios of 0.5 to 1.5 were measured for sizes of 0.05
+    and more. Negative ratios are caused by another error, because no exposure time gives them. H.264 predicts
+    frames from others and lowers the ratio, from 1.06 to 0.94, 0.61 and 0.23 with CRF 10, 17 and 23: without a
+    size, frames are those of a video, and only a large ratio is a reason.
     """
     low, high = 0.6, 2.0
     is_low, is_high = False, ratio > high and ratio - 1 > 4 * std

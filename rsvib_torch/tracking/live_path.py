@@ -38,7 +38,7 @@ class LivePath:
     timing: SensorTiming
     follower: CornerFollower  # a step changes a copy of it
     pairs: tuple[Corners, ...] = ()  # of the last frames, without the tones that are removed; none if it is not known
-    followed_frames: int = 0
+    followed_frames: int = 0  # so far
     repeats: bool = False  # whether the scene repeats itself, such as a fence: corners do not show its path
     middle: float = math.nan  # s, of the last frame
     place: Array = field(default_factory=_zeros)  # (2,) px, there; where the path is lost, that of the frame before
@@ -57,8 +57,9 @@ class LivePath:
         middle = start + self.timing.time_to_middle(grey.shape[int(self.timing.scan_axis)])
         follower, exposure_time = copy(self.follower), self.timing.exposure_time
         corners = follower.next(grey, start)
+        # 1. The last pairs of frames, without the tones. Frames without a scene in common begin a new path, and where
+        # the scene repeats itself, the path is not known.
         repeats = self.repeats if self.followed_frames % _LOOKED_AT else repetition(grey) is not None
-        # 1. The last pairs of frames, without the tones. Frames without a scene in common begin a new path.
         pairs = self.pairs
         if corners is None or repeats:
             pairs = ()
@@ -68,8 +69,15 @@ class LivePath:
             pairs = (*pairs, replace(corners, offsets=corners.offsets - np.diff(table(moved), axis=1)[:, 0]))[-_PAIRS:]
             longest = _LONGEST * self.timing.frame_period
             pairs = tuple(pair for pair in pairs if middle - pair.times.min() < longest)
-        path = replace(self, follower=follower, pairs=pairs, middle=middle, rates=np.zeros((2, 2)))
-        path = replace(path, followed_frames=self.followed_frames + 1, repeats=repeats)
+        path = replace(
+            self,
+            follower=follower,
+            followed_frames=self.followed_frames + 1,
+            repeats=repeats,
+            pairs=pairs,
+            middle=middle,
+            rates=np.zeros((2, 2)),
+        )
         if not pairs:
             return path
         # 2. The path through them: the step from the frame before, and how the rows are displaced.
