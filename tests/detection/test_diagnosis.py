@@ -200,6 +200,15 @@ def test_the_exposures_that_the_blur_agrees_with_are_stated(blurred):
     np.testing.assert_allclose([float(value) / 100 for value in shown], x, rtol=0.1)
 
 
+def test_a_path_of_many_pixels_within_the_exposure_does_not_contradict_it():
+    """The blur by a path of 13 px is far beyond the second order, which gives 0.11 of the expected difference."""
+    timing, motion = replace(BLURRED_TIMING, exposure_rows=33), Motion((6.5, 1.4), (250.0, 52.0), (0.4, 1.3))
+    found = detect_vibration(recorded(BLURRED_SIZE, timing, motion, 4, 0.004, seed=3), timing)
+    assert codes(found) == [set(), set()]
+    error = found.vibration.amplitude[:, 0].numpy() - motion.amplitude
+    assert (np.abs(error) < 3 * found.std.amplitude[:, 0].numpy()).all()
+
+
 def beside(motions, num_frames):
     """Frames whose halves show scenes that move by motions of their own."""
     return torch.cat(
