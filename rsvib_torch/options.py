@@ -102,8 +102,8 @@ class ProjectionOptions:
 
     focal_length: Positive | None = None
     """Focal length in px, for a motion that is a rotation of the camera: displacements then follow from the projection
-    (see ``Camera``), which matters for fields of view above about 20 degrees, and the result has an ``attitude``. None:
-    the displacement by translation is the same in the whole frame."""
+    (see ``Camera``), which matters for fields of view above about 20 degrees. None: the displacement by translation is
+    the same in the whole frame."""
     principal_point: tuple[Number, Number] | None = Field(default=None, strict=False)
     """px along x and y from the centre of the first pixel, as in OpenCV; by default the centre of the frame."""
     distortion: tuple[Number, Number, Number, Number, Number] | None = Field(default=None, strict=False)

@@ -4,7 +4,6 @@ Detection works in row order with all components of the motion in px. A ``Detect
 in rad and zoom relative.
 """
 
-import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -32,72 +31,11 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.registration import OffsetCurve
-from rsvib_torch.results.presentation import Result, axis_head, plain_values
+from rsvib_torch.results.presentation import plain_values
 from rsvib_torch.results.reason import Findings
-from rsvib_torch.text import measured_text, text_table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class AttitudeTones(
-    Result,
-    units={"amplitude": "rad", "amplitude_std": "rad", "frequency": "Hz", "frequency_std": "Hz", "phase": "rad"},
-    shapes=dict.fromkeys(("amplitude", "amplitude_std", "frequency", "frequency_std", "phase", "phase_std"), "... 3 K"),
-):
-    """Vibration of the attitude of the camera: tones of pitch, yaw and roll with standard deviations, (..., 3, K).
-
-    The rotation is right-handed about the axes x (right), y (down) and z (forward) of the camera, see ``Camera``. Roll
-    that was not measured has amplitude 0 and a standard deviation of infinity.
-    """
-
-    amplitude: Tensor  # rad
-    amplitude_std: Tensor  # rad
-    frequency: Tensor  # hz
-    frequency_std: Tensor  # hz
-    phase: Tensor  # rad at the time origin
-    phase_std: Tensor  # rad
-
-    @classmethod
-    def of(cls, vibration: Vibration, std: VibrationStd) -> "AttitudeTones":
-        """The tones of a vibration with a camera."""
-        camera = vibration.camera
-        if camera is None:
-            raise ValueError("the attitude requires a vibration with a camera")
-
-        def turned(values: Tensor, factors: tuple[float, float, float], without_roll: float) -> Tensor:
-            x, y = values[..., 0, :], values[..., 1, :]
-            roll = values[..., 2, :] if values.shape[-2] > 2 else torch.full_like(x, without_roll)
-            return torch.stack([factors[0] * y, factors[1] * x, factors[2] * roll], -2)
-
-        lengths, ones = (1 / camera.focal_length, 1 / camera.focal_length, 1.0), (1.0, 1.0, 1.0)
-        # yaw = -X / f and roll = -theta: the phase changes by pi
-        opposite = vibration.phase.new_tensor([0.0, math.pi, math.pi])[:, None]
-        phase = torch.remainder(turned(vibration.phase, ones, 0.0) + opposite + math.pi, 2 * math.pi) - math.pi
-        return cls(
-            turned(vibration.amplitude, lengths, 0.0),
-            turned(std.amplitude, lengths, math.inf),
-            turned(vibration.frequency, ones, 0.0),
-            turned(std.frequency, ones, math.inf),
-            phase,
-            turned(std.phase, ones, math.inf),
-        )
-
-    def summary(self) -> str:
-        """The tones as a table."""
-        rows = [
-            [
-                *([", ".join(map(str, batch))] if batch else []),
-                ("pitch", "yaw", "roll")[axis],
-                measured_text(1e3 * self.amplitude[at], 1e3 * self.amplitude_std[at]),
-                measured_text(self.frequency[at], self.frequency_std[at]),
-                measured_text(self.phase[at], self.phase_std[at]),
-            ]
-            for at in map(tuple, self.amplitude.nonzero().tolist())
-            for *batch, axis, _ in [at]
-        ]
-        return text_table([*axis_head(self.batch_shape), "amplitude (mrad)", "frequency (Hz)", "phase (rad)"], rows)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -146,11 +84,6 @@ class DetectionResult(
     fitted: Tensor
     sensitivity: TimingSensitivity
     timing: SensorTiming | None = None
-
-    @property
-    def attitude(self) -> AttitudeTones | None:
-        """Tones of pitch, yaw and roll in rad; None if no focal length was given."""
-        return None if self.vibration.camera is None else AttitudeTones.of(self.vibration, self.std)
 
     def spectrum(self) -> DisplacementSpectrum:
         """Amplitude spectrum and power spectral density of the displacement, from the offset curve.
