@@ -47,18 +47,14 @@ _BOUNDS = {
 
 def described(value: object) -> str:
     """Type of a value, with the value if it is short, for error messages."""
-    if value is None or getattr(value, "is_nested", False):
-        return "None" if value is None else "a nested tensor"  # whose shape raises an error
     shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
     if shape is not None and dtype is not None:
         return f"{type(value).__name__} of shape {tuple(shape)} and {dtype}"
-    if isinstance(value, (bool, float, complex, str, bytes)):
+    if isinstance(value, (int, float, complex, str, bytes)):
         return f"{quoted(value)} ({type(value).__name__})"
-    if isinstance(value, int):
-        return f"{value} (int)" if abs(value) < 10**30 else "a very large int"
     if isinstance(value, (list, tuple)) and len(value) < 10 and all(isinstance(item, (int, float)) for item in value):
         return repr(value)
-    return type(value).__name__
+    return "None" if value is None else type(value).__name__
 
 
 def check_single(name: str, batch_shape: Sequence[int]) -> None:
@@ -114,23 +110,17 @@ def mistakes_of(error: ValidationError, data: object, path: str = "", group: obj
 
     If the data are those of a ``group`` of options, errors of unknown keys list the options.
     """
-    found: dict[tuple[object, ...], list[tuple[tuple[str | int, ...], ErrorDetails]]] = {}
+    found: dict[tuple[str | int, ...], list[ErrorDetails]] = {}
     for entry in error.errors(include_url=False):
         keys: tuple[str | int, ...] = ()
-        outer, value = None, data
-        for step in entry["loc"]:
+        value = data
+        for step in entry["loc"]:  # steps that are no keys name members of unions
             if isinstance(value, Mapping) and (step in value or entry["type"] == "missing"):
                 keys, value = (*keys, step), value.get(step)
             elif isinstance(value, (list, tuple)) and isinstance(step, int):
                 keys, value = (*keys, step), value[step] if step < len(value) else None
-            elif outer is None:  # the step names a member of a union
-                outer = keys
-        found.setdefault(keys if outer is None else outer, []).append((keys, entry))
-    mistakes = []
-    for entries in found.values():
-        keys = max((keys for keys, _ in entries), key=len)  # of the members of a union, the one that fits best
-        mistakes.append(_explained(path, keys, [entry for of_entry, entry in entries if of_entry == keys], group))
-    return mistakes
+        found.setdefault(keys, []).append(entry)
+    return [_explained(path, keys, entries, group) for keys, entries in found.items()]
 
 
 def _explained(path: str, keys: Sequence[str | int], entries: list[ErrorDetails], group: object) -> Exception:

@@ -14,7 +14,15 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks.arguments import Channels, FramesLike, FramesOrFiles, as_tensor, channel_axis, check_pixels
+from rsvib_torch.checks.arguments import (
+    Channels,
+    FramesLike,
+    FramesOrFiles,
+    as_tensor,
+    channel_axis,
+    check_pixels,
+    other_axes,
+)
 from rsvib_torch.checks.values import check_number
 from rsvib_torch.frames.entry_points import load_frames
 from rsvib_torch.frames.full_scale import scaled_counts
@@ -196,11 +204,9 @@ def prepare_frames(
         timing = loaded.timed(timing)
     given = as_tensor(name, loaded.frames)
     axis = channel_axis(name, given.shape, channels)
-    if given.ndim == 4 and channels is None and loaded.frames is frames and given.shape[1] not in (1, 3, 4):
-        raise ValueError(
-            f"{name} of shape {tuple(given.shape)} appear to be a batch (B, T, H, W): pass {name}[:, :, None], with an "
-            f'axis of channels, or channels="first" if these are {given.shape[0]} frames of {given.shape[1]} channels'
-        )
+    in_memory = loaded.frames is frames  # files state which axis has the channels
+    if given.ndim > 3 and channels is None and in_memory and given.shape[-3] not in (1, 3, 4):
+        raise other_axes(name, tuple(given.shape))
     # missing pixels become 0 and are marked, so that all further steps compute with finite numbers
     missing = _missing_pixels(given, ignore, allow_missing, axis)
     if missing is not None:
@@ -256,21 +262,11 @@ def as_float_frames(
         1.0
     """
     frames = as_tensor(name, frames)
-    if frames.ndim not in (3, 4, 5):
-        raise ValueError(
-            f"{name} must have shape (T, H, W), (T, C, H, W) or (B, T, C, H, W), got {tuple(frames.shape)}"
-            + (f"; one grey image is {name}[None]" if frames.ndim == 2 else "")
-        )
-    axis = channel_axis(name, frames.shape, channels)
+    images = frames.shape[channel_axis(name, frames.shape, channels)] if frames.ndim == 4 else 1
     count = frames.shape[1 if frames.ndim == 5 else 0]
     if count < minimum_frames:
-        images = frames.shape[axis] if frames.ndim == 4 else 1
-        grey = (
-            f" of {images} channels; store grey frames without channels (T, H, W), in TIFF as pages; a batch of grey "
-            "stacks is (B, T, 1, H, W)"
-        )
-        remedy = grey if images > 1 else ""
-        raise ValueError(f"at least {minimum_frames} frames are needed, got {count}{remedy}")
+        remedy = f" of {images} channels; store grey frames without channels (T, H, W), in TIFF as pages"
+        raise ValueError(f"at least {minimum_frames} frames are needed, got {count}{remedy if images > 1 else ''}")
     if min(frames.shape) == 0:
         raise ValueError(f"{name} must not be empty, got shape {tuple(frames.shape)}")
     if frames.dtype == torch.bool:
