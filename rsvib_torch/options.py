@@ -15,15 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field, SkipValidation
 from pydantic.config import JsonDict
 
-from rsvib_torch.checks.values import (
-    Count,
-    Extensible,
-    NotNegative,
-    Number,
-    Positive,
-    fields_of,
-    options,
-)
+from rsvib_torch.checks.values import Count, Extensible, NotNegative, Number, Positive, fields_of, options
 
 if TYPE_CHECKING:
     from rsvib_torch.checks.arguments import ArrayLike

@@ -17,15 +17,7 @@ from textwrap import fill
 from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform, get_args, get_origin, get_type_hints
 
 import pydantic
-from pydantic import (
-    ConfigDict,
-    Field,
-    TypeAdapter,
-    ValidationError,
-    ValidationInfo,
-    ValidatorFunctionWrapHandler,
-    WrapValidator,
-)
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, ValidatorFunctionWrapHandler
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
@@ -196,13 +188,13 @@ class MistakesError(ValueError):
 _CONFIG = ConfigDict(extra="forbid", strict=True, arbitrary_types_allowed=True, use_attribute_docstrings=True)
 
 
-def _name_of_table(value: object, check: ValidatorFunctionWrapHandler, info: ValidationInfo) -> object:
+def _name_of_table(value: object, check: ValidatorFunctionWrapHandler, info: pydantic.ValidationInfo) -> object:
     """Any text outside of files, which may contain only the names of the package."""
     return value if info.context is None and isinstance(value, str) else check(value)
 
 
 # Mark of a choice whose names are keys of a table that users extend: the function that uses it refuses unknown names.
-Extensible = WrapValidator(_name_of_table)
+Extensible = pydantic.WrapValidator(_name_of_table)
 
 
 @dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(Field,))
