@@ -116,8 +116,8 @@ def flat_command(name: str, command: Callable[[Group], Answer]) -> Callable[...,
     """A command as typer calls it: its options are flat, and its answer is printed."""
     (group,) = (parameter.annotation for parameter in inspect.signature(command, eval_str=True).parameters.values())
     fields = list(_parameters(group))
-    options = {one.name: get_args(one.annotation)[1].param_decls for _, one in fields}
-    names = {name: options[0] for name, options in options.items() if options}  # without arguments
+    declared = {one.name: get_args(one.annotation)[1].param_decls for _, one in fields}
+    names = {name: stated[0] for name, stated in declared.items() if stated}  # without arguments
 
     def flat(**given: object) -> None:
         values: Table = {}

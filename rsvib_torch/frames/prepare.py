@@ -248,15 +248,13 @@ def as_float_frames(
         1.0
     """
     frames = as_tensor(name, frames)
-    images = frames.shape[channel_axis(name, frames.shape, channels)] if frames.ndim == 4 else 1
+    axis = channel_axis(name, frames.shape, channels)
     count = frames.shape[1 if frames.ndim == 5 else 0]
     if count < minimum_frames:
-        remedy = f" of {images} channels; store grey frames without channels (T, H, W), in TIFF as pages"
-        raise ValueError(f"at least {minimum_frames} frames are needed, got {count}{remedy if images > 1 else ''}")
+        images = f" of {frames.shape[axis]} channels; grey frames are (T, H, W), in TIFF pages" * (frames.ndim == 4)
+        raise ValueError(f"at least {minimum_frames} frames are needed, got {count}{images}")
     if min(frames.shape) == 0:
         raise ValueError(f"{name} must not be empty, got shape {tuple(frames.shape)}")
-    if frames.dtype == torch.bool:
-        raise TypeError(f"{name} must be real numbers, got {frames.dtype}; pass {name}.float()")
     if frames.dtype.is_floating_point:
         check_pixels(name, frames)
         return frames if frames.dtype == torch.float64 else frames.to(torch.float32)

@@ -265,7 +265,7 @@ def test_pixels_beyond_all_scales(value):
         (lambda: Reason("unknown"), "code must be one of"),
         (lambda: Reason("tone_blind", value=0.05, limit=0.1), "do not fit its text"),
         (lambda: Reason("tone_averaged_out", value="much", limit=0.1), "do not fit its text"),
-        (lambda: detect(RGB[:1]), "got 1 of 3 channels; store grey frames without"),
+        (lambda: detect(RGB[:1]), "got 1 of 3 channels; grey frames are"),
         (lambda: detect(FRAMES[[0, 1, 1, 0]]), "frames 1 and 2 are identical: .* use frames without copies"),
         (
             lambda: rsv.Camera(390.0, distortion=(-1.0, 0, 0, 0), fisheye=True).check_size(800, 600),
