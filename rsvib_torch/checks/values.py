@@ -82,8 +82,6 @@ def _adapter(kind: Any, **bounds: float | None) -> TypeAdapter[Any]:
 def validated(name: str, value: object, adapter: TypeAdapter[Value]) -> Value:
     """Return the value of an argument if it is of the kind of ``adapter``, as that converts it."""
     value = plain(value)
-    if getattr(value, "is_meta", False):
-        raise TypeError(f"{name} must have a value, got a meta tensor; load the data onto a device first")
     try:
         return adapter.validate_python(value)
     except ValidationError as error:
