@@ -242,8 +242,8 @@ Channels = Literal["first", "last"] | None
 def as_tensor(name: str, value: object) -> Tensor:
     """Return a tensor, array or nested list of numbers as a tensor of the same values and dtype; lists are stacked.
 
-    The tensor shares the memory of an array if PyTorch supports its layout. Read-only arrays, those that are not
-    contiguous and those of foreign byte order (FITS and TIFF files) are copied.
+    The tensor shares the memory of an array if PyTorch supports its layout. Read-only arrays and arrays with negative
+    strides or foreign byte order (FITS and TIFF files) are copied.
     """
     if isinstance(value, Tensor):
         return check_tensor(name, value)
@@ -261,7 +261,9 @@ def as_tensor(name: str, value: object) -> Tensor:
         remedy = "read files with read_stack, pass a list instead of a generator"
         got = f"{type(value).__name__} of {array.dtype}"
         raise TypeError(f"{name} must be a tensor or array of numbers, got {got}; {remedy}")
-    return torch.from_numpy(np.require(array, array.dtype.newbyteorder("="), ["C", "W"]))
+    native = np.require(array, array.dtype.newbyteorder("="), ["W"])
+    is_known = all(stride >= 0 and stride % native.itemsize == 0 for stride in native.strides)  # to PyTorch
+    return torch.from_numpy(native if is_known else native.copy())
 
 
 def channels_appear_last(shape: Sequence[int]) -> bool:
@@ -288,7 +290,7 @@ def channel_axis(name: str, shape: Sequence[int], channels: Channels) -> int:
 
     Shapes are (T, H, W), (T, C, H, W) and (B, T, C, H, W); with ``channels="last"`` (T, H, W, C) and (B, T, H, W, C).
     Without ``channels="first"``, a shape is refused that appears to have up to four channels last in an image of more
-    than four pixels along each axis, or the frames on the last axis.
+    than four pixels along each axis, or the frames on the last axis: (H, W, T) or (H, W, C, T).
     """
     check_choice("channels", channels, (None, "first", "last"))
     shape, is_last = tuple(shape), channels == "last" and len(shape) > 3
@@ -297,7 +299,8 @@ def channel_axis(name: str, shape: Sequence[int], channels: Channels) -> int:
         raise ValueError(f"{name} must have shape (T, H, W), (T, C, H, W) or (B, T, C, H, W), got {shape}{grey}")
     if is_last and channels_appear_last((*shape[-2:], shape[-3])):
         raise ValueError(f'{name} of shape {shape} appear to have channels before the image axes: omit channels="last"')
-    frames_last = len(shape) == 3 and 4 * shape[2] <= min(shape[:2])  # no camera has such high frames
+    few_columns, few_rows = 4 * shape[2] <= min(shape[:2]), shape[2] <= 4 < min(shape[:2])  # no camera has such frames
+    frames_last = few_columns if len(shape) == 3 else few_rows and len(shape) == 4
     if channels != "first" and not is_last and (frames_last or channels_appear_last(shape)):
         raise other_axes(name, shape)
     return -1 if is_last else -3
