@@ -40,15 +40,7 @@ class ConfigFile:
 
 
 def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, object] | None = None) -> Config:
-    """Read a configuration file.
-
-    Only ``[sensor]`` is required.
-
-    * ``[sensor]``: fields of ``SensorTiming``, with ``exposure_time`` and ``frame_rate`` in place of ``exposure_rows``
-      and ``frame_rows`` if they are known in seconds, and ``full_scale``.
-    * ``[detection]``: options of ``detect_vibration``.
-    * ``[restoration]``: options of ``restore``, with ``saturation`` in the unit of the frames' file.
-    * ``[stack]``: ``window`` of ``process_stack``.
+    """Read a configuration file, of which only ``[sensor]`` is required (docs/configuration.md).
 
     Args:
         path: The TOML file; None if ``sensor`` describes the camera.
@@ -64,9 +56,8 @@ def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, obj
         2000.0
     """
     data = {} if path is None else read_toml(Path(path))
-    source = stated_in = "the command line" if path is None else str(path)
-    if sensor and path is not None:
-        stated_in = f"{source} and the command line"
+    source = "the command line" if path is None else str(path)
+    stated_in = f"{source} and the command line" if sensor and path is not None else source
     if sensor:
         stated = data.get("sensor", {})
         if isinstance(stated, dict):

@@ -15,15 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field, SkipValidation
 from pydantic.config import JsonDict
 
-from rsvib_torch.checks.values import (
-    Count,
-    Extensible,
-    NotNegative,
-    Number,
-    Positive,
-    fields_of,
-    options,
-)
+from rsvib_torch.checks.values import Count, Extensible, NotNegative, Number, Positive, fields_of, options
 
 if TYPE_CHECKING:
     from rsvib_torch.checks.arguments import ArrayLike
@@ -253,8 +245,8 @@ class RestorationOptions(ExactOptions, BandedOptions, DewarpOptions, RichardsonL
     3.2 of Liu et al. 2023); ``"dewarp"``: geometry only, fastest; ``"richardson-lucy"``: iterative, non-negative."""
     saturation: Positive | Literal["auto"] | None = Field(default="auto", json_schema_extra=COMMAND_LINE)
     """Level from which pixels are saturated, in the unit of the frames; ``"auto"``: for integer frames full scale, or
-    65520 of 65535 for 12 bits stored left-aligned; none for floating-point frames, whose level is unknown; None for
-    none."""
+    65520 of 65535 for 12 bits stored left-aligned; none for floating-point frames, whose level is unknown. None: no
+    pixel is saturated."""
 
     def __post_init__(self) -> None:
         names = method_options(self.method)

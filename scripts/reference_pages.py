@@ -15,7 +15,6 @@ import harness
 from architecture import table_of_packages
 
 from rsvib_torch.checks.values import fields_of, members_of
-from rsvib_torch.commands.flat_command import option_name
 from rsvib_torch.commands.main import app
 from rsvib_torch.motion.timing import SensorSection
 from rsvib_torch.options import METHOD_OPTIONS, OpticsOptions, RestorationOptions, ToneOptions, WindowOptions
@@ -119,7 +118,7 @@ def parameter_row(parameter: inspect.Parameter) -> list[str]:
     choices = get_args(types[0]) or (types if isinstance(types[0], str) else ())
     choices = [choice for choice in choices if isinstance(choice, str)]
     value = info.metavar or "|".join(choices) or names.get(getattr(types[0], "__name__", ""), "TEXT")
-    option = option_name(parameter)
+    option, *_ = info.param_decls or [None]
     text = parameter.name.upper() if option is None else option if types == [bool] else f"{option} {value}"
     required = parameter.default is inspect.Parameter.empty
     stated = "" if parameter.default in (None, False) else f"`{parameter.default}`"
@@ -138,7 +137,7 @@ def command_page() -> str:
         words = [
             each.name.upper() if each.default is inspect.Parameter.empty else f"[{each.name.upper()}]"
             for each in parameters
-            if option_name(each) is None
+            if not get_args(each.annotation)[1].param_decls
         ]
         lines += [f"## rsvib {name}", "", "```text", " ".join(["rsvib", name, *words, "[OPTIONS]"]), "```", ""]
         lines += [inspect.getdoc(command.callback) or "", ""]

@@ -21,6 +21,7 @@ LONGEST = (
     "test_tutorials.py",
     "test_changing_vibration.py",
     "test_start.py",
+    "test_camera_path.py",
     "test_process_video.py",
     "test_direct.py",
     "test_mosaic.py",

@@ -1,10 +1,10 @@
 """Kornia augmentation: still images as a vibrating rolling-shutter camera records them.
 
-Invariant: the displacement depends on the row only (docs/architecture.md), with roll and zoom in strips of columns.
+Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NoReturn
 
@@ -13,17 +13,14 @@ from kornia.augmentation import GeometricAugmentationBase2D
 from kornia.geometry.boxes import Boxes
 from kornia.geometry.keypoints import Keypoints
 from torch import Tensor
-from torch.nn import functional
 
-from rsvib_torch.checks.arguments import channels_appear_last, check_tensor, checks_arguments
-from rsvib_torch.checks.values import check_choice, check_number, check_whole_number, described
+from rsvib_torch.checks.arguments import as_numbers, channels_appear_last, check_tensor, checks_arguments
+from rsvib_torch.checks.values import MAX_NUMBER, check_choice, check_number, check_whole_number
 from rsvib_torch.execution.parallel import full_precision
 from rsvib_torch.files.reading import Table
 from rsvib_torch.frames.prepare import frames_from_row_order, frames_to_row_order
 from rsvib_torch.imaging import blur_rows, gauss_node_count, trajectory_psf
 from rsvib_torch.imaging.blur import Interpolation
-from rsvib_torch.motion.camera import displacement_at, largest_in_frame
-from rsvib_torch.motion.motion import ColumnMotion, ColumnStrips, Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming, check_timing
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.numerics.interpolation import gauss_legendre, mirrored
@@ -38,117 +35,75 @@ _DRAWN = ("amplitude", "frequency", "phase", "image_motion", "exposure_rows")
 class ImageMotion:
     """Motion of B images in row order, each with its own vibration, start and exposure."""
 
-    vibration: Motion  # motion of batch shape (B,)
+    vibration: Vibration  # of batch shape (B,)
     starts: Tensor  # (B,) exposure start of the first row of each image, seconds
     exposure_time: Tensor  # (B,) seconds
     timing: RowTiming  # the sensor; its exposure is not used
     size: tuple[int, int]  # (rows, columns) of the images
 
     def mean_displacement(self, rows: Tensor) -> Tensor:
-        """Mean components (B, S, A) over the exposures of frame rows (B, S) (Eq. 2)."""
+        """Mean displacement (B, S, 2) in px over the exposures of frame rows (B, S) (Eq. 2)."""
         starts = self.starts[:, None] + rows * self.timing.row_time
         return self.vibration.mean_displacement(starts, self.exposure_time[:, None])
 
     def move(self, points: Tensor) -> Tensor:
         """Positions (x, y) in the frame of scene points (B, S, 2) in px, by Newton's method for their rows."""
-        x, y = (points[..., 1 - axis] - 0.5 * (self.size[axis] - 1) for axis in (1, 0))
         rows, exposure = points[..., 1], self.exposure_time[:, None]
         for _ in range(8):
-            residual = points[..., 1] + displacement_at(self.mean_displacement(rows), x, y)[..., 1] - rows
+            residual = points[..., 1] + self.mean_displacement(rows)[..., 1] - rows
             starts = self.starts[:, None] + rows * self.timing.row_time
-            components = (self.vibration.displacement(times) for times in (starts, starts + exposure))
-            begin, end = (displacement_at(at_time, x, y)[..., 1].detach() for at_time in components)
+            begin, end = (self.vibration.displacement(times)[..., 1].detach() for times in (starts, starts + exposure))
             slope = (end - begin) * self.timing.row_time / exposure
             rows = rows + residual / (1.0 - slope).clamp(min=0.1)
-        return torch.stack([points[..., 0] + displacement_at(self.mean_displacement(rows), x, y)[..., 0], rows], -1)
+        return torch.stack([points[..., 0] + self.mean_displacement(rows)[..., 0], rows], -1)
 
     @full_precision
     def move_images(self, images: Tensor, interpolation: Interpolation) -> Tensor:
         """Form frames (B, C, R, W) in row order from still images, with mirrored boundaries, at least in float32."""
         dtype = images.dtype if images.dtype in (torch.float32, torch.float64) else torch.float32
-        # 1. The motion of all columns of a row, or of strips of columns.
-        strips, motion = self._strips(), self.vibration
-        if strips is not None:
-            frames = len(self.starts.unique())
-            motion = ColumnMotion.of_columns(motion, strips.columns, self.timing, frames, self.size[0])
-        # 2. Its path at the Gauss-Legendre nodes of the exposures of rows.
+        # 1. The path at the Gauss-Legendre nodes of the exposures of rows.
         rows = torch.arange(self.size[0], dtype=torch.float64, device=self.starts.device)
-        starts, exposure = (
-            values.repeat_interleave(motion.batch_shape[0] // len(values), 0)
-            for values in (self.starts[:, None] + rows * self.timing.row_time, self.exposure_time[:, None, None])
-        )
-        count = gauss_node_count(motion, float(exposure.amax()))
+        starts, exposure = self.starts[:, None] + rows * self.timing.row_time, self.exposure_time[:, None, None]
+        count = gauss_node_count(self.vibration, float(exposure.amax()))
         nodes, weights = (values.to(starts.device) for values in gauss_legendre(count))
-        # 3. The point spread functions, which are the same for all channels.
-        psf = trajectory_psf(motion.path(starts, nodes * exposure), weights, interpolation=interpolation)
+        # 2. The point spread functions, which are the same for all channels.
+        psf = trajectory_psf(self.vibration.path(starts, nodes * exposure), weights, interpolation=interpolation)
         psf = type(psf)(psf.first_tap[:, None], psf.weights[:, None], psf.degree)
-        if strips is None:
-            return blur_rows(images.to(dtype), psf).to(images.dtype)
-        return strips.joined(blur_rows(strips.cut(images.to(dtype)), psf)).to(images.dtype)
-
-    def _strips(self) -> ColumnStrips | None:
-        """Strips of columns that move by 0.2 px more or less than their neighbours; None without roll and zoom."""
-        if self.vibration.num_axes == 2:
-            return None
-        first, last = float(self.starts.amin()), float(self.starts.amax()) + self.size[0] * self.timing.row_time
-        most = self.vibration.largest_displacement(first, last + float(self.exposure_time.amax()))
-        pitch = max(16.0, 0.2 / max(float(most[..., 2:].amax()), 1e-9))
-        farthest = float(largest_in_frame(most, self.size[1], self.size[0])[..., 0].amax())
-        return ColumnStrips.of(self.size[1], pitch, margin=math.ceil(farthest) + 4)  # 4 px: support of the kernel
+        return blur_rows(images.to(dtype), psf).to(images.dtype)
 
     def move_masks(self, masks: Tensor) -> Tensor:
         """Labels (B, C, R, W) moved by the mean displacement of their rows, to the nearest pixel."""
-        B, _, R, W = masks.shape
+        B, C, R, W = masks.shape
         rows = torch.arange(R, dtype=torch.float64, device=masks.device)
         columns = torch.arange(W, dtype=torch.float64, device=masks.device)
-        # the inverse of the displacement field, about the middle of the image
-        components = self.mean_displacement(rows.expand(B, -1))[:, :, None]
-        x, y, roll, zoom = functional.pad(components, (0, 4 - components.shape[-1])).unbind(-1)  # (B, R, 1)
-        middle_x, middle_y, scale = 0.5 * (W - 1), 0.5 * (R - 1), 1.0 + zoom
-        right, down = columns - x - middle_x, rows[:, None] - y - middle_y
-        size = scale.square() + roll.square()
-        right, down = (scale * right + roll * down) / size + middle_x, (scale * down - roll * right) / size + middle_y
-        places = (mirrored(place.round().to(torch.int64), length) for place, length in ((down, R), (right, W)))
-        source_rows, source_columns = places
-        index = (source_rows * W + source_columns).flatten(1)[:, None].expand(-1, masks.shape[1], -1)
+        x, y = self.mean_displacement(rows.expand(B, -1))[..., None].unbind(-2)  # (B, R, 1)
+        source_rows = mirrored((rows[:, None] - y).round().to(torch.int64), R)
+        source_columns = mirrored((columns - x).round().to(torch.int64), W)
+        index = (source_rows * W + source_columns).flatten(1)[:, None].expand(-1, C, -1)
         return masks.flatten(-2).gather(-1, index).reshape(masks.shape)
 
     def move_boxes(self, boxes: Tensor) -> Tensor:
-        """Boxes (B, N, 4, 2) of corner pixels, in row order, around the moved content of the given boxes.
-
-        The content of an upright box becomes curved, and its result is the smallest upright box around it. Boxes that
-        are not upright are moved corner by corner.
-        """
-        low, high = boxes.amin(-2), boxes.amax(-2)
-        count = int((high - low)[..., 1].amax().ceil()) + 2
+        """Smallest upright boxes (B, N, 4, 2) of corner pixels, in row order, around the moved sides of boxes."""
+        sides = boxes.roll(-1, -2) - boxes
+        count = int(sides[..., 1].abs().amax().ceil()) + 2  # points of a side, at most one row apart
         steps = torch.linspace(0.0, 1.0, count, dtype=boxes.dtype, device=boxes.device)
-        side_rows = low[..., 1, None] + (high - low)[..., 1, None] * steps  # (B, N, S), at most one row apart
-        columns = (x[..., None].expand_as(side_rows) for x in (low[..., 0], high[..., 0]))
-        sides = torch.stack([torch.stack([of_side, side_rows], -1) for of_side in columns], -3)
-        moved = self.move(sides.flatten(1, -2)).reshape(sides.shape).flatten(2, 3)
+        points = boxes[..., None, :] + sides[..., None, :] * steps[:, None]  # (B, N, 4, count, 2)
+        moved = self.move(points.flatten(1, -2)).reshape(points.shape).flatten(2, 3)
         lowest, highest = moved.amin(-2)[..., None, :], moved.amax(-2)[..., None, :]
-        is_high = boxes == high[..., None, :]  # per corner and coordinate
-        around = torch.where(is_high, highest, lowest)
-        upright = (is_high | (boxes == low[..., None, :])).flatten(-2).all(-1)
-        corners = self.move(boxes.flatten(1, -2)).reshape(boxes.shape)
-        return torch.where(upright[..., None, None], around, corners)
+        return torch.where(boxes > boxes.mean(-2, keepdim=True), highest, lowest)  # corners in the given order
 
 
-def _axis_ranges(name: str, value: Range, *, at_least: float = -math.inf) -> tuple[tuple[float, float], ...]:
-    """Lowest and highest value of the axes x and y, from a number or a range for both or for each."""
-    if not isinstance(value, Sequence):
-        return ((check_number(name, value, at_least=at_least),) * 2,) * 2
-    pairs = value if any(isinstance(part, Sequence) for part in value) else (value, value)
-    ranges = []
-    for pair in pairs:
-        if len(pairs) != 2 or not isinstance(pair, Sequence) or len(pair) != 2:
-            forms = "a number, (low, high) or ((low, high), (low, high)) for x and y"
-            raise TypeError(f"{name} must be {forms}, got {quoted(value)}")
-        low, high = (check_number(name, number, at_least=at_least) for number in pair)
-        if low > high:
-            raise ValueError(f"{name} must not have low above high, got ({low:g}, {high:g})")
-        ranges.append((low, high))
-    return tuple(ranges)
+def _axis_ranges(name: str, value: Range, *, at_least: float = -MAX_NUMBER) -> Tensor:
+    """Lowest and highest value (2, 2) of the axes x and y, from a number or a range for both or for each."""
+    ranges = as_numbers(name, value)
+    if ranges.shape not in ((), (2,), (2, 2)):
+        forms = "a number, (low, high) or ((low, high), (low, high)) for x and y"
+        raise TypeError(f"{name} must be {forms}, got {quoted(value)}")
+    for low, high in ranges.expand(2, 2).tolist():
+        check_number(name, low, at_least=at_least)
+        if not low <= high <= MAX_NUMBER:
+            raise ValueError(f"{name} must not have low above high or beyond {MAX_NUMBER:g}, got ({low:g}, {high:g})")
+    return ranges.expand(2, 2)
 
 
 class RollingShutterVibration(GeometricAugmentationBase2D):
@@ -170,9 +125,6 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         frequency: Range of f in Hz.
         phase: Range of phi in rad.
         image_motion: Range of v in px/s.
-        roll: Range of the amplitude of the rotation about the optical axis in rad, ``(low, high)`` or a number, with
-            frequency and phase from the ranges of x; None for no roll.
-        zoom: The same for the relative change of scale.
         exposure_rows: Exposure in row times, a number or ``(low, high)``; by default that of the sensor.
         tones: Number of tones of each axis.
         interpolation: ``"cubic"``, or ``"linear"``, which adds a slight blur.
@@ -197,8 +149,6 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         frequency: Range = (20.0, 200.0),
         phase: Range = (-math.pi, math.pi),
         image_motion: Range = 0.0,
-        roll: float | tuple[float, float] | None = None,
-        zoom: float | tuple[float, float] | None = None,
         exposure_rows: float | tuple[float, float] | None = None,
         tones: int = 1,
         interpolation: Interpolation = "cubic",
@@ -213,35 +163,30 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         self.timing = timing
         self.tones = check_whole_number("tones", tones, at_least=1)
         exposures = _axis_ranges("exposure_rows", timing.exposure_rows if exposure_rows is None else exposure_rows)[0]
-        for value in exposures:
+        for value in exposures.tolist():
             check_number("exposure_rows", value, above=0.0, at_most=timing.frame_rows)
-        turns: tuple[tuple[float, float], ...] = ()
-        for name, of_turn in (("roll", roll), ("zoom", zoom))[: 2 if zoom is not None else int(roll is not None)]:
-            if isinstance(of_turn, Sequence) and any(isinstance(part, Sequence) for part in of_turn):
-                raise TypeError(f"{name} must be a number or (low, high), got {quoted(of_turn)}")
-            turns += _axis_ranges(name, 0.0 if of_turn is None else of_turn, at_least=0.0)[:1]
-        self.flags = {"image_motion": _axis_ranges("image_motion", image_motion), "exposure_rows": exposures}
-        self.flags |= {"amplitude": _axis_ranges("amplitude", amplitude, at_least=0.0) + turns}
-        for name, drawn, lowest in (("frequency", frequency, 0.0), ("phase", phase, -math.inf)):
-            ranges = _axis_ranges(name, drawn, at_least=lowest)
-            self.flags[name] = ranges + ranges[:1] * len(turns)
-        self.flags["interpolation"] = interpolation
+        self.flags = {
+            "amplitude": _axis_ranges("amplitude", amplitude, at_least=0.0),
+            "frequency": _axis_ranges("frequency", frequency, at_least=0.0),
+            "phase": _axis_ranges("phase", phase),
+            "image_motion": _axis_ranges("image_motion", image_motion),
+            "exposure_rows": exposures,
+            "interpolation": interpolation,
+        }
 
     def forward(self, input: Tensor, params: Parameters | None = None, **kwargs: object) -> Tensor:
         """Record images (H, W), (C, H, W) or (B, C, H, W); the other arguments are those of Kornia's augmentations."""
         if not torch.compiler.is_compiling():
             check_tensor("input", input)
-        if params is not None and not isinstance(params, Mapping):
-            raise TypeError(f"params must be those of a former call, got {described(params)}")
         return super().forward(input, params, **kwargs)
 
     @checks_arguments
     def generate_parameters(self, batch_shape: tuple[int, ...]) -> Parameters:
-        """Draw one motion per image: amplitude, frequency, phase (B, A, K), image_motion (B, 2), exposure_rows (B,)."""
+        """Draw one motion per image: amplitude, frequency, phase (B, 2, K), image_motion (B, 2), exposure_rows (B,)."""
         draws = 1 if self.same_on_batch else batch_shape[0]
 
         def uniform(name: str, *shape: int) -> Tensor:
-            low, high = torch.tensor(self.flags[name], device=self.device, dtype=self.dtype).unbind(-1)
+            low, high = self.flags[name].to(self.device, self.dtype).unbind(-1)
             return low + (high - low) * torch.rand(draws, *shape, *low.shape, device=self.device, dtype=self.dtype)
 
         drawn = {name: uniform(name, self.tones).mT for name in ("amplitude", "frequency", "phase")}

@@ -9,7 +9,7 @@ import inspect
 import operator
 import os
 import types
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache, reduce, wraps
 from typing import Annotated, Any, Literal, ParamSpec, Self, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -249,32 +249,21 @@ def as_tensor(name: str, value: object) -> Tensor:
         return check_tensor(name, value)
     if isinstance(value, np.ma.MaskedArray):
         raise TypeError(f"{name} must not be a masked array; pass its data, and the mask as ignore=")
-    if isinstance(value, (list, tuple)) and any(isinstance(item, (list, tuple)) or _is_array(item) for item in value):
+    if isinstance(value, (list, tuple)) and any(isinstance(item, (list, tuple, *_ARRAYS)) for item in value):
         items = [as_tensor(f"{name}[{index}]", item) for index, item in enumerate(value)]
         kinds = [f"{tuple(item.shape)} {str(item.dtype).removeprefix('torch.')} on {item.device}" for item in items]
         for index, kind in enumerate(kinds):
             if kind != kinds[0]:
                 raise ValueError(f"{name} must be alike, but {name}[{index}] is {kind} and {name}[0] is {kinds[0]}")
         return torch.stack(items)
-    try:
-        if _is_array(value):
-            array = np.asarray(value)
-            native = array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))
-            unsupported = any(stride < 0 or stride % native.itemsize for stride in native.strides)
-            return torch.from_numpy(native.copy() if unsupported or not native.flags.writeable else native)
-        return check_tensor(name, torch.as_tensor(value, device="cpu"))
-    except (TypeError, ValueError, RuntimeError) as error:
-        kind = f" of {value.dtype}" if isinstance(value, np.ndarray) else ""
-        parts = value if isinstance(value, (list, tuple)) else [value]
-        files = any(isinstance(part, (str, os.PathLike)) for part in parts)
-        remedy = "; read files with read_stack" if files else "; pass a list" if isinstance(value, Iterator) else ""
-        got = f"{type(value).__name__}{kind}{remedy}"
-        raise TypeError(f"{name} must be a tensor or array of numbers, got {got}") from error
-
-
-def _is_array(value: object) -> bool:
-    """Whether NumPy can convert the value without interpreting its elements: arrays, data sets of files, images."""
-    return hasattr(value, "__array__") or hasattr(value, "__array_interface__")
+    array = np.asarray(value)  # of data sets of files and images as well
+    if array.dtype.kind not in "biuf":
+        remedy = "read files with read_stack, pass a list instead of a generator"
+        got = f"{type(value).__name__} of {array.dtype}"
+        raise TypeError(f"{name} must be a tensor or array of numbers, got {got}; {remedy}")
+    native = np.require(array, array.dtype.newbyteorder("="), ["W"])
+    is_known = all(stride >= 0 and stride % native.itemsize == 0 for stride in native.strides)  # to PyTorch
+    return torch.from_numpy(native if is_known else native.copy())
 
 
 def channels_appear_last(shape: Sequence[int]) -> bool:
@@ -282,35 +271,36 @@ def channels_appear_last(shape: Sequence[int]) -> bool:
     return len(shape) >= 3 and shape[-1] <= 4 < min(shape[-3:-1])
 
 
+# Axes of frames, and what is to be passed for others, by their number.
+_AXES = {
+    3: '(T, H, W): one image (H, W, C) is {name}[None] with channels="last", (H, W, T) is {name}.permute(2, 0, 1)',
+    4: '(T, C, H, W): pass channels="last" for (T, H, W, C), {name}[:, :, None] for a batch (B, T, H, W)',
+    5: '(B, T, C, H, W): pass channels="last" for (B, T, H, W, C), {name}.permute(0, 2, 1, 3, 4) for (B, C, T, H, W)',
+}
+
+
+def other_axes(name: str, shape: tuple[int, ...]) -> ValueError:
+    """The error about frames whose axes appear to be others."""
+    remedies = _AXES[len(shape)].format(name=name)
+    return ValueError(f'{name} of shape {shape} do not appear to be {remedies}, or channels="first" if they are')
+
+
 def channel_axis(name: str, shape: Sequence[int], channels: Channels) -> int:
     """The axis of the channels: -1 if they are last, -3 if they come before the image axes or do not exist.
 
     Shapes are (T, H, W), (T, C, H, W) and (B, T, C, H, W); with ``channels="last"`` (T, H, W, C) and (B, T, H, W, C).
-    Without ``channels``, a shape is refused that appears to have up to four channels last in an image of more than four
-    pixels along each axis, or the frames on the last axis or behind three channels.
+    Without ``channels="first"``, a shape is refused that appears to have up to four channels last in an image of more
+    than four pixels along each axis, or the frames on the last axis: (H, W, T) or (H, W, C, T).
     """
     check_choice("channels", channels, (None, "first", "last"))
-    shape, axes = tuple(shape), len(shape)
-    appears_last = channels_appear_last(shape)
-    if channels == "last" and axes >= 4 and channels_appear_last((*shape[-2:], shape[-3])):
-        raise ValueError(
-            f'{name} of shape {shape} appear to have their channels before the image axes: omit channels="last"'
-        )
-    # What frames of another order appear to be, and what is to be passed for them.
-    turned, orders = f"{name}.permute", {3: "(T, H, W)", 4: "(T, C, H, W)", 5: "(B, T, C, H, W)"}
-    alone = f'{name}[None] with channels="last"; {turned}(2, 0, 1) if the frames lie on the last axis'
-    last_first = f'channels="last" or {turned}{(0, 3, 1, 2) if axes == 4 else (0, 1, 4, 2, 3)}'
-    problem = None
-    if axes == 3 and appears_last and channels != "first":
-        problem = f"be one image (H, W, C): pass {alone}; or"
-    elif channels is None and axes == 3 and 4 * shape[2] <= min(shape[:2]):  # no camera has such high frames
-        problem = f"be (H, W, T): pass {turned}(2, 0, 1), or"
-    elif channels is None and axes == 4 and shape[2] <= 4 < min(shape[:2]):
-        problem = f"be (H, W, C, T): pass {turned}(3, 2, 0, 1), or"
-    elif channels is None and axes == 5 and shape[1] == 3 and shape[2] > 4:
-        problem = f"be (B, C, T, H, W): pass {turned}(0, 2, 1, 3, 4), or"
-    elif channels is None and appears_last and axes in (4, 5):
-        problem = f"have their channels last: pass {last_first}, or"
-    if problem is not None:
-        raise ValueError(f'{name} of shape {shape} appear to {problem} channels="first" if they are {orders[axes]}')
-    return -1 if channels == "last" and axes > 3 else -3
+    shape, is_last = tuple(shape), channels == "last" and len(shape) > 3
+    if len(shape) not in _AXES:
+        grey = f"; one grey image is {name}[None]" if len(shape) == 2 else ""
+        raise ValueError(f"{name} must have shape (T, H, W), (T, C, H, W) or (B, T, C, H, W), got {shape}{grey}")
+    if is_last and channels_appear_last((*shape[-2:], shape[-3])):
+        raise ValueError(f'{name} of shape {shape} appear to have channels before the image axes: omit channels="last"')
+    few_columns, few_rows = 4 * shape[2] <= min(shape[:2]), shape[2] <= 4 < min(shape[:2])  # no camera has such frames
+    frames_last = few_columns if len(shape) == 3 else few_rows and len(shape) == 4
+    if channels != "first" and not is_last and (frames_last or channels_appear_last(shape)):
+        raise other_axes(name, shape)
+    return -1 if is_last else -3

@@ -17,15 +17,7 @@ from textwrap import fill
 from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform, get_args, get_origin, get_type_hints
 
 import pydantic
-from pydantic import (
-    ConfigDict,
-    Field,
-    TypeAdapter,
-    ValidationError,
-    ValidationInfo,
-    ValidatorFunctionWrapHandler,
-    WrapValidator,
-)
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, ValidatorFunctionWrapHandler
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
@@ -47,18 +39,14 @@ _BOUNDS = {
 
 def described(value: object) -> str:
     """Type of a value, with the value if it is short, for error messages."""
-    if value is None or getattr(value, "is_nested", False):
-        return "None" if value is None else "a nested tensor"  # whose shape raises an error
     shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
     if shape is not None and dtype is not None:
         return f"{type(value).__name__} of shape {tuple(shape)} and {dtype}"
-    if isinstance(value, (bool, float, complex, str, bytes)):
+    if isinstance(value, (int, float, complex, str, bytes)):
         return f"{quoted(value)} ({type(value).__name__})"
-    if isinstance(value, int):
-        return f"{value} (int)" if abs(value) < 10**30 else "a very large int"
     if isinstance(value, (list, tuple)) and len(value) < 10 and all(isinstance(item, (int, float)) for item in value):
         return repr(value)
-    return type(value).__name__
+    return "None" if value is None else type(value).__name__
 
 
 def check_single(name: str, batch_shape: Sequence[int]) -> None:
@@ -94,8 +82,6 @@ def _adapter(kind: Any, **bounds: float | None) -> TypeAdapter[Any]:
 def validated(name: str, value: object, adapter: TypeAdapter[Value]) -> Value:
     """Return the value of an argument if it is of the kind of ``adapter``, as that converts it."""
     value = plain(value)
-    if getattr(value, "is_meta", False):
-        raise TypeError(f"{name} must have a value, got a meta tensor; load the data onto a device first")
     try:
         return adapter.validate_python(value)
     except ValidationError as error:
@@ -114,23 +100,17 @@ def mistakes_of(error: ValidationError, data: object, path: str = "", group: obj
 
     If the data are those of a ``group`` of options, errors of unknown keys list the options.
     """
-    found: dict[tuple[object, ...], list[tuple[tuple[str | int, ...], ErrorDetails]]] = {}
+    found: dict[tuple[str | int, ...], list[ErrorDetails]] = {}
     for entry in error.errors(include_url=False):
         keys: tuple[str | int, ...] = ()
-        outer, value = None, data
-        for step in entry["loc"]:
+        value = data
+        for step in entry["loc"]:  # steps that are no keys name members of unions
             if isinstance(value, Mapping) and (step in value or entry["type"] == "missing"):
                 keys, value = (*keys, step), value.get(step)
             elif isinstance(value, (list, tuple)) and isinstance(step, int):
                 keys, value = (*keys, step), value[step] if step < len(value) else None
-            elif outer is None:  # the step names a member of a union
-                outer = keys
-        found.setdefault(keys if outer is None else outer, []).append((keys, entry))
-    mistakes = []
-    for entries in found.values():
-        keys = max((keys for keys, _ in entries), key=len)  # of the members of a union, the one that fits best
-        mistakes.append(_explained(path, keys, [entry for of_entry, entry in entries if of_entry == keys], group))
-    return mistakes
+        found.setdefault(keys, []).append(entry)
+    return [_explained(path, keys, entries, group) for keys, entries in found.items()]
 
 
 def _explained(path: str, keys: Sequence[str | int], entries: list[ErrorDetails], group: object) -> Exception:
@@ -206,13 +186,13 @@ class MistakesError(ValueError):
 _CONFIG = ConfigDict(extra="forbid", strict=True, arbitrary_types_allowed=True, use_attribute_docstrings=True)
 
 
-def _name_of_table(value: object, check: ValidatorFunctionWrapHandler, info: ValidationInfo) -> object:
+def _name_of_table(value: object, check: ValidatorFunctionWrapHandler, info: pydantic.ValidationInfo) -> object:
     """Any text outside of files, which may contain only the names of the package."""
     return value if info.context is None and isinstance(value, str) else check(value)
 
 
 # Mark of a choice whose names are keys of a table that users extend: the function that uses it refuses unknown names.
-Extensible = WrapValidator(_name_of_table)
+Extensible = pydantic.WrapValidator(_name_of_table)
 
 
 @dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(Field,))

@@ -2,15 +2,14 @@
 
 import inspect
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from types import NoneType
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 import typer
 from pydantic import Field
-from typer.models import ArgumentInfo
+from typer.models import ArgumentInfo, OptionInfo
 
 from rsvib_torch.checks.values import fields_of, members_of, options
 from rsvib_torch.commands.terminal import Answer, current_output, error_line, show_answer
@@ -19,7 +18,6 @@ from rsvib_torch.options import COMMAND_LINE
 
 Group = TypeVar("Group")
 _NOT_RELIABLE = 3  # exit code
-_NONE = object()  # value of an option that is stated as "none"
 
 
 def argument(default: object = ..., **form: Any) -> Any:
@@ -54,7 +52,7 @@ class Given:
                 # the first sentence of the description
                 text = re.split(r"(?<=\.) (?=[A-Z])", stated.description.replace("``", "").replace('"', ""))[0]
                 text = self.context + text[0].lower() + text[1:] if self.context else text
-                form = {"text": text, "show_default": ", or ".join(usual) or False}
+                form = {"help": text, "show_default": ", or ".join(usual) or False}
                 yield _parameter(name, stated.annotation, None, {**form, **self.forms.get(name, {})})
 
 
@@ -70,51 +68,40 @@ class _OutputOptions:
     """Print the traceback of an error."""
 
 
-def _number_or_word(words: Sequence[str], text: str) -> object:
+def _number_or_word(words: tuple[str, ...], text: str) -> object:
     """Value of an option that is a number or one of some words, which are the same in capitals."""
-    if text.lower() in words:
-        return _NONE if text.lower() == "none" else text.lower()
     try:
-        return float(text)
+        return text.lower() if text.lower() in words else float(text)
     except ValueError as error:
         raise typer.BadParameter(f"expected a number or {' or '.join(words)}, got {text!r}") from error
 
 
 def _parameter(name: str, annotation: object, default: object, form: Table) -> inspect.Parameter:
     """A field as typer reads it; the group checks bounds, and has alternatives such as "auto" that options lack."""
-    form = dict(form)
-    members = [form.pop("kind")] if "kind" in form else members_of(annotation)
-    choices = tuple(choice for member in members if get_origin(member) is Literal for choice in get_args(member))
-    plain = [member for member in members if get_origin(member) is not Literal]
+    form = {"show_default": True, **form}
+    members = members_of(annotation)
+    choices = tuple(choice for kind in members if get_origin(kind) is Literal for choice in get_args(kind))
+    plain = [kind for kind in members if get_origin(kind) is not Literal]
     if choices and float in plain:  # a number, or a word
-        words = (*choices, *(("none",) if NoneType in get_args(annotation) else ()))
-        form.setdefault("parser", partial(_number_or_word, words))
-        form.setdefault("metavar", "|".join(("NUMBER", *words)))
-    kind: Any = str if str in plain else plain[0] if plain else type(choices[0])
+        form = {"parser": partial(_number_or_word, choices), "metavar": "|".join(("NUMBER", *choices)), **form}
+    kind: Any = str if str in plain else plain[-1] if plain else type(choices[0])
     kind = Literal[choices] if not plain and kind is str else kind
-    option_name = f"--{name.replace('_', '-')}"
-    names = form.pop("names", ()) or ([option_name] if kind is bool else [])
-    make: Callable[..., object] = typer.Argument if form.pop("positional", False) else typer.Option
-    info = make(*names, help=form.pop("text"), **{"show_default": True} | form)
+    info: ArgumentInfo | OptionInfo
+    if form.pop("positional", False):
+        info = ArgumentInfo(default=..., **form)
+    else:
+        names = form.pop("names", None) or [f"--{name.replace('_', '-')}"]
+        info = OptionInfo(default=..., param_decls=names, **form)
     default = False if default is None and kind is bool else default
     kind = Annotated[kind | None if default is None else kind, info]
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
-
-
-def option_name(parameter: inspect.Parameter) -> str | None:
-    """The option of the command line that states a parameter; None of an argument."""
-    info = get_args(parameter.annotation)[1]
-    if isinstance(info, ArgumentInfo):
-        return None
-    stated = (one for one in (info.default, *(info.param_decls or ())) if str(one).startswith("--"))
-    return next(stated, f"--{parameter.name.replace('_', '-')}")
 
 
 def _parameters(group: type) -> Iterator[tuple[str, inspect.Parameter]]:
     """Name of each field of a command with its parameters: arguments, own options, then those that commands share."""
     depth = {name: place for place, kind in enumerate(group.__mro__) for name in inspect.get_annotations(kind)}
     fields = fields_of(group)
-    forms = {name: {"text": stated.description, **(stated.json_schema_extra or {})} for name, stated in fields.items()}
+    forms = {name: {"help": stated.description, **(stated.json_schema_extra or {})} for name, stated in fields.items()}
     for name in sorted(fields, key=lambda name: -1 if forms[name].get("positional") else depth[name]):
         stated = fields[name]
         mark = next((mark for mark in stated.metadata if isinstance(mark, Given)), None)
@@ -129,7 +116,8 @@ def flat_command(name: str, command: Callable[[Group], Answer]) -> Callable[...,
     """A command as typer calls it: its options are flat, and its answer is printed."""
     (group,) = (parameter.annotation for parameter in inspect.signature(command, eval_str=True).parameters.values())
     fields = list(_parameters(group))
-    names = {one.name: option for _, one in fields if (option := option_name(one)) is not None}
+    declared = {one.name: get_args(one.annotation)[1].param_decls for _, one in fields}
+    names = {name: stated[0] for name, stated in declared.items() if stated}  # without arguments
 
     def flat(**given: object) -> None:
         values: Table = {}
@@ -137,11 +125,10 @@ def flat_command(name: str, command: Callable[[Group], Answer]) -> Callable[...,
             value = given[parameter.name]
             if place == parameter.name:
                 values[place] = value
-            else:
-                is_given = value is not None and (value is not False or parameter.default is None)
-                values.setdefault(place, {}).update(
-                    {parameter.name: None if value is _NONE else value} if is_given else {}
-                )
+                continue
+            of_group = values.setdefault(place, {})
+            if value is not None and value is not False:
+                of_group[parameter.name] = value
         output = current_output()
         output.as_json, output.quiet = bool(given["as_json"]), bool(given["quiet"])
         # a configuration file has keys of the same names

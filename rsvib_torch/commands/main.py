@@ -34,15 +34,12 @@ _EXAMPLES = """
         --frame-rate 29.97 --full-scale 4095
   rsvib init clip.mp4 --camera "iPhone 12" --exposure 1/500
   rsvib cameras iphone 12
-  rsvib cameras gopro --json
   rsvib run frames.tif results --config camera.toml --report
   rsvib run long.tif results --config camera.toml --memory 2GB --resume
   rsvib detect frames.tif --config camera.toml --out found
-  rsvib detect frames.tif --config camera.toml --out found --overwrite --json
   rsvib restore frames.tif restored.tif --config camera.toml \\
         --vibration found/vibration.json
   rsvib motion frames.tif --config camera.toml --out motion.csv
-  rsvib motion frames.tif --config camera.toml --out motion.csv --knot-rows 12
   rsvib restore frames.tif restored.tif --config camera.toml \\
         --motion gyroscope.csv --unit rad/s --focal-length 1800
   rsvib calibrate led.mp4 --frequency 1000 --frame-rate 29.97 \\

@@ -61,12 +61,12 @@ TIME: Table = {"parser": seconds, "metavar": "TIME"}  # form of an option
 # Forms of the keys of [sensor] that are options.
 SENSOR_FORMS: dict[str, Table] = {
     "row_time": {
-        "text": "Time from one row to the next, e.g. 14.6us, or 15/1080ms of a readout of 1080 rows.",
+        "help": "Time from one row to the next, e.g. 14.6us, or 15/1080ms of a readout of 1080 rows.",
         **TIME,
     },
-    "exposure_time": {"names": ["--exposure"], "text": "Exposure time, e.g. 1/500 or 2ms.", **TIME},
+    "exposure_time": {"names": ["--exposure"], "help": "Exposure time, e.g. 1/500 or 2ms.", **TIME},
     "frame_rate": {
-        "text": "Frames per second of the sensor, e.g. 29.97 or 30000/1001.",
+        "help": "Frames per second of the sensor, e.g. 29.97 or 30000/1001.",
         "parser": rate,
         "metavar": "NUMBER",
         "show_default": "from the file, or the configuration",
@@ -170,13 +170,21 @@ class StackCommand(CameraOptions):
         return torch.device("cuda" if self.device != "cpu" and torch.cuda.is_available() else "cpu")
 
 
+def _joint(text: str) -> bool | int:
+    """Value of --joint."""
+    if text != "all" and not text.isdecimal():
+        raise typer.BadParameter(f"expected 'all' or a number of frames, got {text!r}")
+    return text == "all" or int(text)
+
+
 _JOINT: Table = {
-    "text": "Number of neighbouring frames that are restored jointly, or 'all' for one image of all frames (of each "
+    "help": "Number of neighbouring frames that are restored jointly, or 'all' for one image of all frames (of each "
     "window).",
-    "kind": str,
+    "parser": _joint,
+    "metavar": "NUMBER|all",
 }
 _WINDOW: Table = {
-    "text": "Largest number of frames that are processed together; of restore --vibration all.",
+    "help": "Largest number of frames that are processed together; of restore --vibration all.",
     "show_default": "from the configuration, or 8",
 }
 
@@ -225,10 +233,6 @@ class RestoringCommand(StackCommand):
         if method != options.get("method", "exact"):  # other options belong to the configured method
             kept = ("saturation", *method_options(method))
             options = {name: value for name, value in options.items() if name in kept}
-        if "joint" in given:
-            if given["joint"] != "all" and not (given["joint"].isdecimal() and int(given["joint"]) >= 1):
-                raise ValueError(f"--joint must be 'all' or a number of frames, got {given['joint']!r}")
-            given["joint"] = given["joint"] == "all" or int(given["joint"])
         options |= given
         RestorationOptions(**options)  # raises an error for wrong ones
         level = options.get("saturation")

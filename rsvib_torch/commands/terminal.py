@@ -10,16 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import typer
+from rich import progress
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    SpinnerColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
 from rsvib_torch.execution.progress import listening
 from rsvib_torch.files.reading import Table
@@ -154,16 +146,17 @@ def working(description: str, *, counts: bool = False) -> Iterator[Callable[[int
     otherwise, the loops in it report their steps.
     """
     console = Console(stderr=True)
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(bar_width=10), MofNCompleteColumn())
-    times = (TimeElapsedColumn(), TimeRemainingColumn())
+    text, bar = progress.TextColumn("{task.description}", markup=False), progress.BarColumn(bar_width=10)
+    times = (progress.TimeElapsedColumn(), progress.TimeRemainingColumn())
+    columns = (progress.SpinnerColumn(), text, bar, progress.MofNCompleteColumn(), *times)
     is_shown = console.is_terminal and not _outputs[-1].quiet
-    with Progress(SpinnerColumn(), *columns, *times, console=console, transient=True, disable=not is_shown) as progress:
-        task = progress.add_task(printable(description), total=None)
+    with progress.Progress(*columns, console=console, transient=True, disable=not is_shown) as shown:
+        task = shown.add_task(printable(description), total=None)
 
         def show(done: int, total: int, unit: str = "frames") -> None:
             if done == 0:  # another loop
-                progress.reset(task)
-            progress.update(task, description=printable(f"{description} ({unit})"), completed=done, total=total)
+                shown.reset(task)
+            shown.update(task, description=printable(f"{description} ({unit})"), completed=done, total=total)
 
         with nullcontext() if counts else listening(show):
             yield show

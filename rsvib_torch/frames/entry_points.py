@@ -13,7 +13,7 @@ from typing import Any, Concatenate, NamedTuple, ParamSpec, Protocol, TypeVar, c
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from rsvib_torch.checks.arguments import FramesLike, FramesOrFiles, PathLike, checks_arguments
 from rsvib_torch.checks.values import fields_of, flat_options
@@ -65,13 +65,6 @@ class FileFunction(Protocol[P, Result_co]):
         """Call the function."""
 
 
-class SourceFunction(Protocol[P, Result_co]):
-    """A function of the file of a stack and of the timing."""
-
-    def __call__(self, source: PathLike, timing: SensorTiming, *args: P.args, **kwargs: P.kwargs) -> Result_co:
-        """Call the function."""
-
-
 class VibrationFunction(Protocol[P, Result_co]):
     """A function of frames, their timing and their vibration."""
 
@@ -104,7 +97,9 @@ def vibration_options(
 
 def source_options(
     options: Callable[P, Options],
-) -> Callable[[Callable[[PathLike, SensorTiming, Options], Result]], SourceFunction[P, Result]]:
+) -> Callable[
+    [Callable[[PathLike, SensorTiming, Options], Result]], Callable[Concatenate[PathLike, SensorTiming, P], Result]
+]:
     """Decorator of a function ``(source, timing, options)``."""
     return lambda function: flat_options(options, checks_arguments(function))
 
@@ -133,14 +128,10 @@ class TimedModule(nn.Module):
 
     def extra_repr(self) -> str:
         """The timing, and the options that differ from their defaults."""
-        timing = self.timing
-        stated = [f"row_time={timing.row_time:g}", f"exposure_rows={timing.exposure_rows:g}"]
-        stated.append(f"frame_rows={timing.frame_rows:g}")
-        for name, field in fields_of(type(self.options)).items():
-            value = getattr(self.options, name)
-            if not isinstance(value, Tensor) and value != field.get_default():
-                stated.append(f"{name}={value!r}")
-        return ", ".join(stated)
+        fields = fields_of(type(self.options)).items()
+        options = ((name, repr(getattr(self.options, name)), repr(field.default)) for name, field in fields)
+        stated = [f"{name}={value}" for name, value, default in options if value != default]
+        return ", ".join([f"timing={self.timing}", *stated])
 
 
 def entry_point(options: Callable[..., object], function: Callable[..., object]) -> Callable[..., Any]:

@@ -14,21 +14,19 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks.arguments import Channels, FramesLike, FramesOrFiles, as_tensor, channel_axis, check_pixels
+from rsvib_torch.checks.arguments import (
+    Channels,
+    FramesLike,
+    FramesOrFiles,
+    as_tensor,
+    channel_axis,
+    check_pixels,
+    other_axes,
+)
 from rsvib_torch.checks.values import check_number
+from rsvib_torch.frames import pixels
 from rsvib_torch.frames.entry_points import load_frames
 from rsvib_torch.frames.full_scale import scaled_counts
-from rsvib_torch.frames.pixels import (
-    are_mosaics,
-    check_mosaic,
-    colours_of,
-    cut_columns,
-    detailed_parts,
-    fill_by_colour,
-    fill_with_means,
-    luminance,
-    mosaic_free,
-)
 from rsvib_torch.motion.timing import RowTiming, SensorTiming, check_timing, row_axes
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import MaskedInputOptions
@@ -51,9 +49,7 @@ def frames_from_row_order(frames: Tensor, timing: SensorTiming) -> Tensor:
 def offsets_from_row_order(offsets: Tensor, timing: SensorTiming) -> Tensor:
     """Turn displacements or offsets (..., A) in row order back to image axes (x, y) and, if A > 2, roll and zoom."""
     _, signs = row_axes(timing, offsets.shape[-1])
-    if min(signs) < 0:
-        offsets = offsets * offsets.new_tensor(signs)
-    return magnitudes_from_row_order(offsets, timing)
+    return magnitudes_from_row_order(offsets * offsets.new_tensor(signs), timing)
 
 
 def magnitudes_from_row_order(values: Tensor, timing: SensorTiming, axis: int = -1) -> Tensor:
@@ -67,9 +63,7 @@ def magnitudes_from_row_order(values: Tensor, timing: SensorTiming, axis: int = 
         [[2.0, 1.0, 3.0]]
     """
     order, _ = row_axes(timing, values.shape[axis])
-    if order == sorted(order):
-        return values
-    return values[..., order] if axis == -1 else values[..., order, :]
+    return values.index_select(axis, torch.tensor(order, device=values.device))
 
 
 def reasons_from_row_order(reasons: Sequence[Reason], timing: SensorTiming) -> tuple[Reason, ...]:
@@ -128,7 +122,7 @@ class PreparedFrames:
         """The images with local means at missing pixels."""
         if self.missing is None:
             return self.images
-        return (fill_with_means if self.colours is None else fill_by_colour)(self.images, self.missing)
+        return (pixels.fill_with_means if self.colours is None else pixels.fill_by_colour)(self.images, self.missing)
 
     def compared(self, restored: Tensor) -> tuple[Tensor, Tensor]:
         """Raw frames and restored ones at their pixels, as they can be compared; of a mosaic, the smooth luminance."""
@@ -136,7 +130,7 @@ class PreparedFrames:
         restored = restored[..., ::points, ::points]
         if self.colours is None:
             return self.filled, restored
-        return mosaic_free(self.filled), mosaic_free(luminance(restored))
+        return pixels.mosaic_free(self.filled), pixels.mosaic_free(pixels.luminance(restored))
 
     def from_row_order(self, images: Tensor) -> Tensor:
         """Images (B, T', C, H', W') in row order with the axes, orientation and dtype of the user's frames.
@@ -196,11 +190,9 @@ def prepare_frames(
         timing = loaded.timed(timing)
     given = as_tensor(name, loaded.frames)
     axis = channel_axis(name, given.shape, channels)
-    if given.ndim == 4 and channels is None and loaded.frames is frames and given.shape[1] not in (1, 3, 4):
-        raise ValueError(
-            f"{name} of shape {tuple(given.shape)} appear to be a batch (B, T, H, W): pass {name}[:, :, None], with an "
-            f'axis of channels, or channels="first" if these are {given.shape[0]} frames of {given.shape[1]} channels'
-        )
+    in_memory = loaded.frames is frames  # files state which axis has the channels
+    if given.ndim > 3 and channels is None and in_memory and given.shape[-3] not in (1, 3, 4):
+        raise other_axes(name, tuple(given.shape))
     # missing pixels become 0 and are marked, so that all further steps compute with finite numbers
     missing = _missing_pixels(given, ignore, allow_missing, axis)
     if missing is not None:
@@ -228,9 +220,9 @@ def prepare_frames(
         images = images.masked_fill(of_rows, 0)
     colours = None
     if mosaic is not None:
-        check_mosaic(mosaic, frames_from_row_order(images, timing).shape, name)
+        pixels.check_mosaic(mosaic, frames_from_row_order(images, timing).shape, name)
         size = images.shape[-2:] if timing.scan_axis == -2 else images.shape[:-3:-1]
-        pattern = frames_to_row_order(colours_of(mosaic, *size), timing)
+        pattern = frames_to_row_order(pixels.colours_of(mosaic, *size), timing)
         colours = pattern.to(images.device).expand(images.shape)
     return PreparedFrames(
         images, missing, saturated, row_timing, timing, tuple(given.shape), axis, dtype, full_scale, colours, lost
@@ -256,25 +248,13 @@ def as_float_frames(
         1.0
     """
     frames = as_tensor(name, frames)
-    if frames.ndim not in (3, 4, 5):
-        raise ValueError(
-            f"{name} must have shape (T, H, W), (T, C, H, W) or (B, T, C, H, W), got {tuple(frames.shape)}"
-            + (f"; one grey image is {name}[None]" if frames.ndim == 2 else "")
-        )
     axis = channel_axis(name, frames.shape, channels)
     count = frames.shape[1 if frames.ndim == 5 else 0]
     if count < minimum_frames:
-        images = frames.shape[axis] if frames.ndim == 4 else 1
-        grey = (
-            f" of {images} channels; store grey frames without channels (T, H, W), in TIFF as pages; a batch of grey "
-            "stacks is (B, T, 1, H, W)"
-        )
-        remedy = grey if images > 1 else ""
-        raise ValueError(f"at least {minimum_frames} frames are needed, got {count}{remedy}")
+        images = f" of {frames.shape[axis]} channels; grey frames are (T, H, W), in TIFF pages" * (frames.ndim == 4)
+        raise ValueError(f"at least {minimum_frames} frames are needed, got {count}{images}")
     if min(frames.shape) == 0:
         raise ValueError(f"{name} must not be empty, got shape {tuple(frames.shape)}")
-    if frames.dtype == torch.bool:
-        raise TypeError(f"{name} must be real numbers, got {frames.dtype}; pass {name}.float()")
     if frames.dtype.is_floating_point:
         check_pixels(name, frames)
         return frames if frames.dtype == torch.float64 else frames.to(torch.float32)
@@ -284,25 +264,23 @@ def as_float_frames(
 def _missing_pixels(frames: Tensor, ignore: object, allow_missing: bool, axis: int) -> Tensor | None:
     """Mask of the frames' shape, with channels on ``axis``, of ignored and NaN pixels; None if there are none."""
     missing = None
-    if allow_missing and frames.dtype.is_floating_point and bool(torch.isnan(frames.sum())):
-        missing = torch.isnan(frames)
-        missing = missing if bool(missing.any()) else None  # the sum of +inf and -inf is NaN as well
+    if allow_missing and frames.dtype.is_floating_point and bool(frames.sum().isnan()):
+        missing = frames.isnan()
     if ignore is None:
         return missing
     mask = as_tensor("ignore", ignore).to(frames.device)
-    shape, target = tuple(mask.shape), tuple(frames.shape)
-    planes = target if frames.ndim < 4 else (*target[:axis], *target[axis:][1:])
-    if shape != target:
+    if mask.dtype != torch.bool:
+        raise TypeError(f"ignore must be a bool tensor, got {mask.dtype}")
+    if mask.shape != frames.shape:
+        planes = tuple((frames if frames.ndim < 4 else frames.select(axis, 0)).shape)
         try:
             mask = mask.expand(planes)
         except RuntimeError as error:
             raise ValueError(
-                f"ignore {shape} does not fit the frames: ignore must be a boolean mask of shape {target}, or one "
-                f"that broadcasts to {planes}"
+                f"ignore {tuple(mask.shape)} does not fit the frames: ignore must be a boolean mask of shape "
+                f"{tuple(frames.shape)}, or one that broadcasts to {planes}"
             ) from error
-        mask = mask if frames.ndim < 4 else mask.unsqueeze(axis).expand(target)
-    if mask.dtype != torch.bool:
-        raise TypeError(f"ignore must be a bool tensor, got {mask.dtype}")
+        mask = (mask if frames.ndim < 4 else mask.unsqueeze(axis)).expand(frames.shape)
     return mask if missing is None else mask | missing
 
 
@@ -393,8 +371,8 @@ class GreyFrames:
         """The given number of neighbouring columns of each stack, those with the most detail."""
         if columns >= self.images.shape[-1]:
             return self
-        parts = detailed_parts(self.images, columns)
-        return self._changed(lambda values: cut_columns(values, parts))
+        parts = pixels.detailed_parts(self.images, columns)
+        return self._changed(lambda values: pixels.cut_columns(values, parts))
 
     def columns(self, part: slice) -> "GreyFrames":
         """Some neighbouring columns of each stack."""
@@ -469,10 +447,10 @@ def grey_frames(
 
 def without_mosaic(images: Tensor) -> Tensor:
     """Grey frames (B, T, H, W), of colour mosaics without the pattern of the colours, which does not move."""
-    mosaic = are_mosaics(images[:, 0])
+    mosaic = pixels.are_mosaics(images[:, 0])
     if not bool(mosaic.any()):
         return images
-    return torch.where(mosaic[:, None, None, None], mosaic_free(images), images)
+    return torch.where(mosaic[:, None, None, None], pixels.mosaic_free(images), images)
 
 
 def constant_frame(place: int | str) -> str:

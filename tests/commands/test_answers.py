@@ -175,7 +175,7 @@ def test_overwrite_replaces_all_results_of_the_earlier_run(place, config, tmp_pa
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_contains_every_text_and_two_examples(capsys, monkeypatch, command):
+def test_help_contains_every_text_and_examples(capsys, monkeypatch, command):
     assert rsvib(command, "-h") == 0
     text = capsys.readouterr().out
     assert rsvib(command, "--help") == 0
@@ -188,7 +188,7 @@ def test_help_contains_every_text_and_two_examples(capsys, monkeypatch, command)
     for paragraph in inspect.getdoc(function).split("\n\n"):
         assert " ".join(paragraph.split()) in words
     examples = text.partition("Examples:\n")[2].replace("\\\n", " ").strip().splitlines()
-    assert len(examples) == 2
+    assert examples
     group = typer.main.get_command(main.app)
     for example in examples:
         program, name, *arguments = shlex.split(example)

@@ -146,7 +146,7 @@ def test_options_of_restoration_come_from_config_or_command_line(place, tmp_path
     assert decibel(read_stack(out / "restored.tif")[0], at_rest.numpy()) > 40
     for options, message in (
         (("--method", "dewarp", "--joint", "2"), "joint is no option of method='dewarp', which has none"),
-        (("--method", "exact", "--joint", "many"), "--joint must be 'all' or a number of frames, got 'many'"),
+        (("--method", "exact", "--joint", "many"), "expected 'all' or a number of frames, got 'many'"),
     ):
         assert message in refused(capsys, *common, *options)
 

@@ -33,7 +33,7 @@ def vibration(t, tones, decay, sweep):
     return parts
 
 
-def recorded(
+def simulated(
     tones,
     subject=True,
     decay=np.inf,
@@ -73,6 +73,17 @@ def recorded(
             total += image / samples
         frames.append(np.clip(np.round(255 * (total + 0.004 * rng.normal(size=total.shape))), 0, 255).astype(np.uint8))
     return frames
+
+
+RECORDINGS = {}
+
+
+def recorded(tones, **options):
+    """Frames of ``simulated``; those that several tests use are simulated once."""
+    key = repr((list(tones.items()), options))
+    if key not in RECORDINGS:
+        RECORDINGS[key] = simulated(tones, **options)
+    return [frame.copy() for frame in RECORDINGS[key]]
 
 
 def fitted(frames, timing=TIMING):
