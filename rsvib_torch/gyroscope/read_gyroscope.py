@@ -97,8 +97,7 @@ def read_gyroscope(path: str | os.PathLike[str]) -> AngularRates:
     * gyroflow ``.gcsv``: rates times ``gscale`` in rad/s about the axes of the line ``orientation`` (``YxZ``: the rates
       about y, minus x and z of the sensor; a small letter is a negative axis), times times ``tscale`` in s.
     * GoPro ``.mp4`` with a track of GPMF data (``gpmd``): the entries ``GYRO`` divided by ``SCAL``, about the axes of
-      ``ORIN`` if there is one, otherwise in the order of the file. Times are those of the video: of the stamps of the
-      camera, or of the ends of the packets with samples at equal distances.
+      ``ORIN`` if there is one, otherwise in the order of the file. Times are those of the video, at equal distances.
     * CSV: a first line with the names of the columns: a time in s (``t``, ``time``, ``timestamp``) and three rates
       (``x``, ``gx``, ``gyro_x``, ``wx`` ...) with their unit (``gx_rad_s``, ``x (deg/s)``). Other files:
       ``AngularRates(times, rates)``.
@@ -139,7 +138,7 @@ def read_gyroscope(path: str | os.PathLike[str]) -> AngularRates:
     try:
         turned = torch.from_numpy(rates @ orientation_matrix(axes).numpy().T)
         result = AngularRates(torch.from_numpy(times.copy()), turned, f"{path.name}, {source}")
+        check_times(times, longest_gap=float("inf"))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    check_times(path, times, longest_gap=float("inf"))
     return result

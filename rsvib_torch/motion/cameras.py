@@ -13,7 +13,6 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from rsvib_torch.checks.values import check_number, check_whole_number, described, options
-from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.text import measured_text, number_of, quoted
 
 # of the rate; 24 and 25 per second, which differ by 4 %, are different modes: of 151 pairs of modes of one size with
@@ -73,25 +72,6 @@ class CameraMode:
     def size(self) -> str:
         """Width, height and frame rate, for messages."""
         return f"{self.width} x {self.height} px at {self.frame_rate:.4g}/s"
-
-    def timing(self, exposure_time: float) -> SensorTiming:
-        """Timing of the sensor in this mode, for an exposure time in s.
-
-        Raises:
-            ValueError: As ``SensorTiming.from_seconds``.
-
-        Example:
-            >>> import rsvib_torch as rsv
-            >>> timing = rsv.camera_mode("iPhone 12", width=3840, height=2160, frame_rate=59.94).timing(1 / 500)
-            >>> round(1e6 * timing.row_time, 3), round(timing.frame_rows)
-            (2.306, 7236)
-        """
-        return SensorTiming.from_seconds(
-            row_time=self.row_time,
-            row_time_std=self.row_time_std,
-            exposure_time=exposure_time,
-            frame_rate=self.frame_rate,
-        )
 
     def __str__(self) -> str:
         readout = measured_text(1e3 * self.readout_time, 1e3 * self.readout_time_std)

@@ -208,14 +208,7 @@ class Vibration(
 
     @classmethod
     def stacked(cls, results: Sequence[Self]) -> Self:
-        """Vibrations with the same axes and camera as a batch; the new dimension is the first.
-
-        Those with fewer tones have further ones of amplitude 0.
-
-        Example:
-            >>> Vibration.stacked([Vibration(2.0, 50.0), Vibration(3.0, 40.0)]).amplitude.shape
-            torch.Size([2, 2, 1])
-        """
+        """Vibrations with the same axes and camera as a batch; missing tones have amplitude 0."""
         missing = [max(other.amplitude.shape[-1] for other in results) - one.amplitude.shape[-1] for one in results]
         return super().stacked(
             [
@@ -231,12 +224,7 @@ class Vibration(
         return replace(self, amplitude=self.amplitude * factors[..., None], **polynomial)
 
     def translation(self) -> "Vibration":
-        """The components x and y: the motion of the centre of the frame, without roll and zoom.
-
-        Example:
-            >>> Vibration((3.1, 5.2, 1e-3), (90.0, 61.0, 70.0)).translation().amplitude.flatten().tolist()
-            [3.1, 5.2]
-        """
+        """The components x and y: the motion of the centre of the frame, without roll and zoom."""
         tones = {name: getattr(self, name)[..., :2, :] for name in _QUANTITIES}
         return self._changed(**tones, **{name: getattr(self, name)[..., :2] for name in _POLYNOMIAL}, camera=None)
 
@@ -270,13 +258,13 @@ class Vibration(
         return torch.addcmul(phase, frequency, times[..., None, None], value=2 * math.pi), amplitude, frequency
 
     def drift(self, times: Tensor) -> Tensor:
-        """Displacement v t + a t^2 / 2 of the image motion alone in px; arguments and shapes as in ``displacement``."""
+        """Displacement v t + a t^2 / 2 of the image motion alone in px."""
         times = times.to(dtype=torch.float64, device=self.device)
         velocity, acceleration = self._at(times, self.image_motion), self._at(times, self.image_acceleration)
         return torch.addcmul(velocity, acceleration, times[..., None], value=0.5) * times[..., None]
 
     def displacement(self, times: Tensor) -> Tensor:
-        """Displacement D(t) in px (Eq. 1), float64 (S, axes), at times of shape S as in ``Motion.displacement``."""
+        """Displacement D(t) in px (Eq. 1), as in ``Motion.displacement``."""
         times = times.to(dtype=torch.float64, device=self.device)
         angle, amplitude, _ = self._angle(times)
         return (amplitude * angle.sin()).sum(-1) + self.drift(times) + self._at(times, self.image_shift)
