@@ -75,11 +75,6 @@ def _per_axis(name: str, value: TensorLike, axes: int, device: torch.device | No
     return functional.pad(tensor, (0, axes - tensor.shape[-1]))
 
 
-def _with_trailing(value: float | Tensor, dimensions: int) -> float | Tensor:
-    """A number as it is, a tensor (S) with trailing dimensions of size 1."""
-    return value[(..., *(None,) * dimensions)] if isinstance(value, Tensor) else value
-
-
 def _check_values(values: dict[str, Tensor]) -> None:
     """Raise a ValueError for values that are not finite or too large, and for negative amplitudes or frequencies."""
     # one transfer: the smallest and the largest value of each quantity that is not empty, NaN if one is
@@ -275,11 +270,12 @@ class Vibration(
         A tone keeps its angle at mid-exposure and is attenuated by sinc(f T_e).
         """
         check_broadcast(starts=starts, exposure_time=exposure_time)
-        middle = starts.to(dtype=torch.float64, device=self.device) + 0.5 * exposure_time
+        exposure = torch.as_tensor(exposure_time, dtype=torch.float64, device=self.device)
+        middle = starts.to(dtype=torch.float64, device=self.device) + 0.5 * exposure
         angle, amplitude, frequency = self._angle(middle)
-        attenuation = torch.sinc(frequency * _with_trailing(exposure_time, 2))
+        attenuation = torch.sinc(frequency * exposure[..., None, None])
         tones = (amplitude * attenuation * angle.sin()).sum(-1)
-        curvature = self._at(middle, self.image_acceleration) * (_with_trailing(exposure_time, 1) ** 2 / 24)
+        curvature = self._at(middle, self.image_acceleration) * (exposure[..., None].square() / 24)
         return tones + self.drift(middle) + curvature + self._at(middle, self.image_shift)
 
     def gain(self, interval: float) -> Tensor:

@@ -126,13 +126,6 @@ class _Tones:
         """(K, 4) parameters of the tones."""
         return self.values[:-1].reshape(-1, 4)
 
-    @property
-    def covariance_of_frequencies(self) -> Array:
-        """(2 K, 2 K) of nu of all tones, then of phi."""
-        first = 4 * np.arange(len(self.tones))
-        index = np.concatenate([first + 2, first + 3])
-        return self.covariance[np.ix_(index, index)]
-
 
 def _fitted(rows: _MeasuredRows, axis: int, start: Array) -> _Tones:
     """Weighted least squares from start parameters (4 K + 1,)."""
@@ -219,8 +212,9 @@ def _motion(tones: list[_Tones], timing: RowTiming, num_frames: int, num_rows: i
 def candidates(tones: list[_Tones], clock: CameraClock) -> list[Candidate]:
     """All possible row times that are a local minimum of chi-square, the best first."""
     nu, phi = np.concatenate([one.tones[:, 2:] for one in tones]).T
-    covariances = [one.covariance_of_frequencies.reshape(2, len(one.tones), 2, len(one.tones)) for one in tones]
-    of_nu, mixed, of_phi = (block_diag(*(one[i, :, j] for one in covariances)) for i, j in ((0, 0), (0, 1), (1, 1)))
+    of_nu, mixed, of_phi = (
+        block_diag(*(one.covariance[i:-1:4, j:-1:4] for one in tones)) for i, j in ((2, 2), (2, 3), (3, 3))
+    )
 
     # 1. Values of P / T_row with which a tone has a whole number of further turns per frame.
     most = math.ceil(float(np.abs(nu).max(initial=0.0)) * clock.period / clock.low) + 1

@@ -19,7 +19,7 @@ from rsvib_torch.numerics.tables import Array
 SceneModel = Literal["smooth", "fixed"]
 _TINY = 1e-300  # smallest divisor
 MIN_PERIODS = 1.5  # that a frame must contain
-_HARMONICS = 8  # at most, of the light
+_HARMONICS = 16  # at most, of the light; with 8, the row time of an LED in front of a texture was wrong by 0.2 %
 _CERTAIN = 50.0  # least ``BandFit.certainty``; that of texture stays below it on drawn scenes
 _MIN_PERIOD = 4.0  # rows; shorter bands may be aliases of longer ones
 
