@@ -259,7 +259,7 @@ def find_bands(profiles: Profiles) -> tuple[BandFit, SceneModel]:
     if brightness.shape[1] / best.period < MIN_PERIODS:
         raise ValueError(
             f"flicker is slower than a frame: {brightness.shape[1] / best.period:.2f} periods in its rows, at least "
-            f"{MIN_PERIODS:g} are needed; use a faster flicker"
+            f"{MIN_PERIODS:g} are needed; use a faster flicker; vertical bands need scan_axis='x'"
         )
     return best, model
 
