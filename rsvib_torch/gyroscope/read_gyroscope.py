@@ -82,12 +82,11 @@ def _header(path: Path, lines: Iterator[str]) -> tuple[dict[str, list[str]], int
 
 
 def _scale(path: Path, header: dict[str, list[str]], name: str) -> float:
-    if name not in header:
-        raise ValueError(f"{path}: the header has no {name}")
+    text = header.get(name, ["", "nothing"])[1]
     try:
-        return check_number(name, float(header[name][1]), above=0.0, at_most=1e6)
+        return check_number(name, float(text), above=0.0, at_most=1e6)
     except ValueError:
-        raise ValueError(f"{path}: {name} must be a positive number, got {quoted(header[name][1])}") from None
+        raise ValueError(f"{path}: {name} in the header must be a positive number, got {quoted(text)}") from None
 
 
 @checks_arguments

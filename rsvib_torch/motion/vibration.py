@@ -270,12 +270,12 @@ class Vibration(
         A tone keeps its angle at mid-exposure and is attenuated by sinc(f T_e).
         """
         check_broadcast(starts=starts, exposure_time=exposure_time)
-        exposure = torch.as_tensor(exposure_time, dtype=torch.float64, device=self.device)
-        middle = starts.to(dtype=torch.float64, device=self.device) + 0.5 * exposure
+        middle = starts.to(dtype=torch.float64, device=self.device) + 0.5 * exposure_time
+        exposure = exposure_time[..., None] if isinstance(exposure_time, Tensor) else exposure_time
         angle, amplitude, frequency = self._angle(middle)
-        attenuation = torch.sinc(frequency * exposure[..., None, None])
+        attenuation = torch.sinc(frequency * (exposure[..., None] if isinstance(exposure, Tensor) else exposure))
         tones = (amplitude * attenuation * angle.sin()).sum(-1)
-        curvature = self._at(middle, self.image_acceleration) * (exposure[..., None].square() / 24)
+        curvature = self._at(middle, self.image_acceleration) * (exposure**2 / 24)
         return tones + self.drift(middle) + curvature + self._at(middle, self.image_shift)
 
     def gain(self, interval: float) -> Tensor:
