@@ -23,10 +23,8 @@ def entry(key, kind, size, count, content):
     return key + kind + struct.pack(">BH", size, count) + content + b"\0" * (-len(content) % 4)
 
 
-def packet(rates, *, total, orientation=b"", stamp=None, first=None, turned=None, exposures=None):
+def packet(rates, *, total, orientation=b"", turned=None, exposures=None):
     accelerations = entry(b"ACCL", b"s", 6, 1, struct.pack(">hhh", 1, 2, 3))
-    if first is not None:
-        accelerations = entry(b"STMP", b"J", 8, 1, struct.pack(">Q", first)) + accelerations
     if turned is not None:  # quaternions of the images against the camera
         is_whole = np.isfinite(turned).all()
         quaternions = np.round(32767 * np.asarray(turned)).astype(">i2" if is_whole else ">f4")
@@ -38,8 +36,6 @@ def packet(rates, *, total, orientation=b"", stamp=None, first=None, turned=None
         values = entry(b"SHUT", b"f", 4, len(exposures), np.asarray(exposures).astype(">f4").tobytes())
         more = entry(b"STRM", b"\0", 1, len(values), values)
     parts = [entry(b"TSMP", b"L", 4, 1, struct.pack(">I", total))]
-    if stamp is not None:
-        parts.append(entry(b"STMP", b"J", 8, 1, struct.pack(">Q", stamp)))
     parts.append(entry(b"SCAL", b"s", 2, 1, struct.pack(">h", 1000)))
     if orientation:
         parts.append(entry(b"ORIN", b"c", 1, 3, orientation))

@@ -23,7 +23,7 @@ _NUMBERS = {
     b"b": "i1", b"B": "u1", b"c": "u1", b"s": ">i2", b"S": ">u2", b"l": ">i4", b"L": ">u4", b"f": ">f4", b"d": ">f8",
     b"j": ">i8", b"J": ">u8",
 }  # fmt: skip
-_KEYS = (b"GYRO", b"SCAL", b"ORIN", b"STMP", b"TSMP", b"SHUT", b"IORI")  # of the entries that are read
+_KEYS = (b"GYRO", b"SCAL", b"ORIN", b"TSMP", b"SHUT", b"IORI")  # of the entries that are read
 _NONE = np.zeros((0, 0))  # values of an entry that a stream does not have
 
 _Stream = dict[bytes, Array]  # values (N, C) of the entry of each key
@@ -37,10 +37,6 @@ class _Packet:
     duration: float  # s
     streams: list[_Stream]  # of the device that has a gyroscope, or of the first one
     gyroscope: _Stream  # that with angular rates; empty if there is none
-
-    def stated(self, key: bytes) -> float:
-        """The first value of an entry of the gyroscope; NaN without one."""
-        return float(self.gyroscope.get(key, np.full((1, 1), np.nan))[0, 0])
 
 
 @dataclass(frozen=True)
@@ -189,28 +185,19 @@ def _rates(gyroscope: _Stream) -> Array:
 def _sample_times(packets: list[_Packet], counts: Array) -> Array:
     """Times (N,) in s of the samples of all packets, which have ``counts`` samples.
 
-    As in ``GetGPMFSampleRate`` of gpmf-parser, the reference implementation: the clock of stamps (STMP) starts
-    anywhere, and the earliest stamp of the first packet is the start of that packet. Without stamps, the samples up to
-    the end of a packet were taken until then: a straight line. The first packet may begin late, and the last may end
-    early. Ticks (TICK) are not used: they are times of the operating system in ms (gpmf-parser issue 63).
+    The samples up to the end of a packet were taken until then: a straight line, of which the offset and the slope are
+    those of the clock that ``align_motion`` fits. The first packet may begin late, and the last may end early.
     """
     # Number of each sample: those that are missing have numbers, if the totals (TSMP) are stated.
     ends = np.cumsum(counts)
-    stated = np.array([packet.stated(b"TSMP") for packet in packets])
+    stated = np.array([packet.gyroscope.get(b"TSMP", np.full((1, 1), np.nan))[0, 0] for packet in packets])
     if (np.diff(stated) >= counts[1:]).all():
         ends = (stated - stated[0]).astype(np.int64) + counts[0]
-    firsts = (ends - counts).astype(np.float64)
-    number = np.concatenate([first + np.arange(count) for first, count in zip(firsts, counts, strict=True)])
-    # Time of each number: by stamps, by the ends of the packets, or of a few packets by their duration.
+    number = np.concatenate([end - count + np.arange(count) for end, count in zip(ends, counts, strict=True)])
+    # Time of each number, of a few packets by their duration.
     starts = np.array([packet.start for packet in packets])
     if len(packets) < 3:
-        duration = starts[-1] + packets[-1].duration - starts[0]
-        return np.asarray(starts[0] + duration / ends[-1] * number)
-    stamps = 1e-6 * np.array([packet.stated(b"STMP") for packet in packets])
-    if (np.diff(stamps) > 0).all():
-        earliest = 1e-6 * min(stream[b"STMP"][0, 0] for stream in packets[0].streams if b"STMP" in stream)
-        step = (stamps[-1] - stamps[0]) / firsts[-1]
-        known = np.append(stamps, stamps[-1] + step * counts[-1]) - earliest + starts[0]
-        return np.asarray(np.interp(number, np.append(firsts, ends[-1]), known))
-    slope, first = np.polyfit(ends[:-1], starts[1:], 1)
+        first, slope = starts[0], (starts[-1] + packets[-1].duration - starts[0]) / ends[-1]
+    else:
+        slope, first = np.polyfit(ends[:-1], starts[1:], 1)
     return np.asarray(first + slope * number)

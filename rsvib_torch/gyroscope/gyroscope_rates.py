@@ -13,6 +13,7 @@ from torch import Tensor
 from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.values import check_number
 from rsvib_torch.files.number_table import MAX_SAMPLES
+from rsvib_torch.motion.spline import check_increasing
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.results.presentation import Result
 from rsvib_torch.text import quoted, text_table
@@ -51,13 +52,7 @@ class AngularRates(Result, units={"times": "s", "rates": "rad/s"}, shapes={"time
             raise ValueError(f"times must have 4 to {MAX_SAMPLES:,} samples, got {len(times)}")
         if not bool(torch.isfinite(times).all() and torch.isfinite(rates).all()):
             raise ValueError("times and rates must be finite")
-        steps = times.diff()
-        if bool((steps <= 0).any()):
-            place = int((steps <= 0).nonzero()[0, 0])
-            raise ValueError(
-                f"times must increase, but sample {place + 1} at {float(times[place + 1]):.9g} s comes after "
-                f"{float(times[place]):.9g} s"
-            )
+        check_increasing(times.cpu().numpy())
         object.__setattr__(self, "times", times.to(torch.float64))
         object.__setattr__(self, "rates", rates.to(torch.float64))
 

@@ -82,12 +82,11 @@ def _header(path: Path, lines: Iterator[str]) -> tuple[dict[str, list[str]], int
 
 
 def _scale(path: Path, header: dict[str, list[str]], name: str) -> float:
-    if name not in header:
-        raise ValueError(f"{path}: the header has no {name}")
+    text = header.get(name, ["", "nothing"])[1]
     try:
-        return check_number(name, float(header[name][1]), above=0.0, at_most=1e6)
+        return check_number(name, float(text), above=0.0, at_most=1e6)
     except ValueError:
-        raise ValueError(f"{path}: {name} must be a positive number, got {quoted(header[name][1])}") from None
+        raise ValueError(f"{path}: {name} in the header must be a positive number, got {quoted(text)}") from None
 
 
 @checks_arguments
@@ -97,8 +96,7 @@ def read_gyroscope(path: str | os.PathLike[str]) -> AngularRates:
     * gyroflow ``.gcsv``: rates times ``gscale`` in rad/s about the axes of the line ``orientation`` (``YxZ``: the rates
       about y, minus x and z of the sensor; a small letter is a negative axis), times times ``tscale`` in s.
     * GoPro ``.mp4`` with a track of GPMF data (``gpmd``): the entries ``GYRO`` divided by ``SCAL``, about the axes of
-      ``ORIN`` if there is one, otherwise in the order of the file. Times are those of the video: of the stamps of the
-      camera, or of the ends of the packets with samples at equal distances.
+      ``ORIN`` if there is one, otherwise in the order of the file. Times are those of the video, at equal distances.
     * CSV: a first line with the names of the columns: a time in s (``t``, ``time``, ``timestamp``) and three rates
       (``x``, ``gx``, ``gyro_x``, ``wx`` ...) with their unit (``gx_rad_s``, ``x (deg/s)``). Other files:
       ``AngularRates(times, rates)``.
@@ -139,7 +137,7 @@ def read_gyroscope(path: str | os.PathLike[str]) -> AngularRates:
     try:
         turned = torch.from_numpy(rates @ orientation_matrix(axes).numpy().T)
         result = AngularRates(torch.from_numpy(times.copy()), turned, f"{path.name}, {source}")
+        check_times(times, longest_gap=float("inf"))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    check_times(path, times, longest_gap=float("inf"))
     return result

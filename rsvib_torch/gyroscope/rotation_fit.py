@@ -277,24 +277,23 @@ def _solved(fit: RotationFit, linear: _Linear) -> tuple[RotationFit, Tensor, Ten
 def _weighed(fit: RotationFit, linear: _Linear, of_effects: Tensor, follows: Tensor) -> Errors:
     """Weights and standard deviations from the residuals."""
     off, along = linear.residual.unbind(-1)
-    old, used = fit.errors, fit.errors.weight > 0
+    old, used, is_still = fit.errors, fit.errors.weight > 0, fit.errors.depth == 0  # still: without a translation
     # 1. Corners: the median is not sensitive to those that move by themselves.
-    both = linear.residual[used].abs() if old.depth == 0 else off[used].abs()
+    both = linear.residual[used].abs() if is_still else off[used].abs()
     sigma = max(1.4826 * float(both.median()), _LEAST_STD)
     weight = follows * _biweight(off / sigma)
     # 2. Depths, from what the residuals along the lines have beyond sigma.
     used = weight > 0
-    excess = max((1.4826 * float(along[used].abs().median())) ** 2 - sigma**2, 0.0)
+    excess = 0.0 if is_still else max((1.4826 * float(along[used].abs().median())) ** 2 - sigma**2, 0.0)
     depth = (excess / max(float(linear.line[used].square().median()), 1e-12)) ** 0.5
     along_weight = _biweight(along / (sigma**2 + (depth * linear.line).square()).sqrt())
     # 3. Effects: their mean square over the determined part of their number (MacKay 1992); EM takes 100 rounds.
     determined = (1 - of_effects / old.effects.square()).clamp(min=1e-2).sum(0)
     effects = (fit.effects.square().sum(0) / determined).sqrt()
     effects = torch.minimum(torch.maximum(effects, old.effects / 3), old.effects * 3).clamp(min=_LEAST_STD)
-    if old.depth == 0:  # without a translation
-        effects = torch.cat([effects[:3], old.effects[3:]])
-        return Errors(weight, _biweight(along / sigma), sigma, 0.0, effects, old.mean_translation)
-    return Errors(weight, along_weight, sigma, depth, effects, max(3 * excess**0.5, _LEAST_STD))
+    effects = torch.cat([effects[:3], old.effects[3:]]) if is_still else effects
+    mean_translation = old.mean_translation if is_still else max(3 * excess**0.5, _LEAST_STD)
+    return Errors(weight, along_weight, sigma, depth, effects, mean_translation)
 
 
 def _biweight(size: Tensor) -> Tensor:

@@ -115,7 +115,6 @@ class Camera:
 
     @property
     def _tangential(self) -> tuple[float, float]:
-        """(p1, p2)."""
         return (0.0, 0.0) if self.fisheye else (self.distortion[2], self.distortion[3])
 
     def with_axes(self, order: Sequence[int], signs: Sequence[float]) -> "Camera":
@@ -123,12 +122,11 @@ class Camera:
         if sorted(order)[:2] != [0, 1] or any(sign not in (1, -1) for sign in signs):
             raise ValueError(f"order must be a permutation of the axes and signs 1 or -1, got {order} and {signs}")
         x, y = (signs[k] * self.principal_point[order[k]] for k in (0, 1))
-        if self.fisheye:
-            return replace(self, principal_point=(x, y))
-        k1, k2, p1, p2, k3 = self.distortion
-        tangential = (p2, p1)  # along x, along y
-        p2, p1 = (signs[k] * tangential[order[k]] for k in (0, 1))
-        return Camera(self.focal_length, (x, y), (k1, k2, p1, p2, k3))
+        distortion = list(self.distortion)
+        if not self.fisheye:  # p2 belongs to x, p1 to y
+            tangential = distortion[3], distortion[2]
+            distortion[3], distortion[2] = (signs[k] * tangential[order[k]] for k in (0, 1))
+        return replace(self, principal_point=(x, y), distortion=tuple(distortion))
 
     def _radial(self, s: Tensor) -> tuple[Tensor, Tensor]:
         """The factor L, and twice its derivative by s."""
@@ -188,15 +186,7 @@ class Camera:
         return u, v
 
     def check_size(self, width: int, height: int) -> None:
-        """Raise a ``ValueError`` unless every point of a frame of this size has one ray.
-
-        Example:
-            >>> Camera(500.0, distortion=(-2.0, 0.0, 0.0, 0.0, 0.0)).check_size(1920, 1080)
-            Traceback (most recent call last):
-            ...
-            ValueError: distortion (-2.0, 0.0, 0.0, 0.0, 0.0) with focal_length=500 px is not invertible in frames of \
-1920 x 1080 px: check the order (k1, k2, p1, p2, k3) and the size of the frames of the calibration
-        """
+        """Raise a ``ValueError`` unless every point of a frame of this size has one ray."""
         x = torch.linspace(-0.5, 0.5, 33, dtype=torch.float64) * width
         y = torch.linspace(-0.5, 0.5, 33, dtype=torch.float64)[:, None] * height
         u, v = self.rays(x, y)
@@ -207,8 +197,7 @@ class Camera:
         if folded or not bool(torch.isfinite(torch.stack([u, v])).all()) or not missed < 1e-6:
             raise ValueError(
                 f"distortion {self.distortion} with focal_length={self.focal_length:g} px is not invertible in frames "
-                f"of {width} x {height} px: check the order ({names}) and the size of the frames of the "
-                "calibration"
+                f"of {width} x {height} px: check the order ({names}) and the size of the frames of the calibration"
             )
 
     def displacement(self, components: Tensor, x: Tensor, y: Tensor) -> Tensor:
@@ -238,12 +227,7 @@ class Camera:
         return self.focal_length * (moved - rest)
 
     def factors(self, x: Tensor, y: Tensor, axes: int) -> Tensor:
-        """Displacement (S, 2, A) by unit components at positions (S) in px from the centre, for small angles.
-
-        Example:
-            >>> Camera(1000.0).factors(torch.tensor(500.0), torch.tensor(0.0), 3).tolist()
-            [[1.25, 0.0, 0.0], [0.0, 1.0, 500.0]]
-        """
+        """Displacement (S, 2, A) by unit components at positions (S) in px from the centre, for small angles."""
         check_whole_number("axes", axes, at_least=2, at_most=4)
         u, v = self.rays(x, y)
         x, y = torch.broadcast_tensors(x.to(u), y.to(u))
@@ -254,12 +238,7 @@ class Camera:
         return torch.cat([moved, zoomed[..., None]], -1)[..., :axes]
 
     def attitude(self, components: Tensor) -> Tensor:
-        """(S, 3) rad: pitch, yaw and roll of the camera for components (S, A) of a motion.
-
-        Example:
-            >>> Camera(1000.0).attitude(torch.tensor([-2.0, 1.0, 1e-3], dtype=torch.float64)).tolist()
-            [0.001, 0.002, -0.001]
-        """
+        """(S, 3) rad: pitch, yaw and roll of the camera for components (S, A) of a motion."""
         pitch, yaw = components[..., 1] / self.focal_length, -components[..., 0] / self.focal_length
         roll = -components[..., 2] if components.shape[-1] > 2 else torch.zeros_like(pitch)
         return torch.stack([pitch, yaw, roll], -1)

@@ -9,25 +9,24 @@ from dataclasses import replace
 from functools import cache
 from importlib.resources import files
 
+import numpy as np
 from pydantic import TypeAdapter
 
 from rsvib_torch.checks.values import check_number, check_whole_number, described, options
-from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.text import measured_text, number_of, quoted
 
-# Ratio of heights; of pairs of modes in the table with equal aspect and rate, 21 of 24 up to this ratio have the same
-# readout within 10 %, and 13 of 24 above it. Of pairs of one size at different rates, only 99 of 151 do.
-_MAX_SCALE = 1.6
-_SAME_RATE = 0.03  # of the rate; 24 and 25 per second, which differ by 4 %, are different modes
-_SAME_ASPECT = 0.01  # of the ratio of width and height; 2160 and 2176 rows of 3840 px are one mode
+# of the rate; 24 and 25 per second, which differ by 4 %, are different modes: of 151 pairs of modes of one size with
+# different rates, 99 have the same readout within 10 %
+_SAME_RATE = 0.03
+_SAME_SIZE = 0.01  # of width and height; 2160 and 2176 rows of 3840 px are one mode
 
 
 @options
 class CameraMode:
-    """Measured readout time of a camera model in one mode (https://github.com/gyroflow/lens_profiles).
+    """Readout time of a camera model in one mode, measured by users (https://github.com/gyroflow/lens_profiles).
 
-    Users measured the times. About 3 in 4 are within 3 % of others of the same mode, 4 in 5 within 10 %: confirm a time
-    of a single calibration with ``calibrate_row_time`` or ``calibrate_row_time_by_motion``.
+    About 3 in 4 are within 3 % of others of the same mode, 4 in 5 within 10 %: confirm a time of a single calibration
+    with ``calibrate_row_time`` or ``calibrate_row_time_by_motion``.
 
     Attributes:
         brand: Manufacturer.
@@ -41,7 +40,6 @@ class CameraMode:
             and at least 3 %.
         calibrations: Number of calibrations.
         readout_direction: ``"forward"`` if a calibration states it, otherwise empty.
-        measured_rows: Rows of the calibrations; ``camera_mode`` assumes that scaled frames are read in the same time.
     """
 
     brand: str
@@ -54,7 +52,6 @@ class CameraMode:
     readout_time_std: float
     calibrations: int
     readout_direction: str
-    measured_rows: int
 
     @property
     def name(self) -> str:
@@ -63,7 +60,7 @@ class CameraMode:
 
     @property
     def row_time(self) -> float:
-        """Time between the exposure starts of neighbouring rows in s: readout time / height."""
+        """Readout time / height in s."""
         return self.readout_time / self.height
 
     @property
@@ -76,30 +73,9 @@ class CameraMode:
         """Width, height and frame rate, for messages."""
         return f"{self.width} x {self.height} px at {self.frame_rate:.4g}/s"
 
-    def timing(self, exposure_time: float) -> SensorTiming:
-        """Timing of the sensor in this mode, for an exposure time in s.
-
-        Raises:
-            ValueError: As ``SensorTiming.from_seconds``.
-
-        Example:
-            >>> import rsvib_torch as rsv
-            >>> timing = rsv.camera_mode("iPhone 12", width=3840, height=2160, frame_rate=59.94).timing(1 / 500)
-            >>> round(1e6 * timing.row_time, 3), round(timing.frame_rows)
-            (2.306, 7236)
-        """
-        return SensorTiming.from_seconds(
-            row_time=self.row_time,
-            row_time_std=self.row_time_std,
-            exposure_time=exposure_time,
-            frame_rate=self.frame_rate,
-        )
-
     def __str__(self) -> str:
         readout = measured_text(1e3 * self.readout_time, 1e3 * self.readout_time_std)
-        text = f"{self.name}, {self.size}: readout {readout} ms, {number_of(self.calibrations, 'calibration')}"
-        same = f" of {self.measured_rows} rows, which are assumed to be read in the same time"
-        return text + same * (self.measured_rows != self.height)
+        return f"{self.name}, {self.size}: readout {readout} ms, {number_of(self.calibrations, 'calibration')}"
 
 
 @cache
@@ -108,7 +84,7 @@ def _modes() -> tuple[CameraMode, ...]:
     text = (files("rsvib_torch") / "motion" / "readout_times.csv").read_text(encoding="utf-8")
     lines = csv.DictReader(line for line in text.splitlines() if not line.startswith("#"))
     mode = TypeAdapter(CameraMode)
-    return tuple(mode.validate_strings({**line, "measured_rows": line["height"]}) for line in lines)
+    return tuple(mode.validate_strings(line) for line in lines)
 
 
 def _letters(text: str) -> str:
@@ -144,23 +120,18 @@ def find_cameras(search: str = "") -> tuple[CameraMode, ...]:
 def _unknown(name: str, modes: Sequence[CameraMode]) -> ValueError:
     """The error of a name that no model has, with the models of some modes or else of similar names."""
     names = {_letters(key): f"{mode.brand} {mode.model}" for mode in _modes() for key in (mode.model, mode.name)}
-    near = difflib.get_close_matches(_letters(name), names, n=4)
-    similar = [*dict.fromkeys([f"{mode.brand} {mode.model}" for mode in modes] or [names[key] for key in near])]
-    listed = ", ".join(similar[:4]) or "none (rsvib cameras lists all)"
-    if modes:
-        more = f" and {len(similar) - 4} more (rsvib cameras lists all)" if len(similar) > 4 else ""
-        return ValueError(
-            f"no camera in the table of readout times has exactly the name {quoted(name)}; give one of those that "
-            f"contain it if it is the camera: {listed}{more}"
-        )
-    return ValueError(f"no camera {quoted(name)} in the table of readout times; similar: {listed}")
+    near = [names[key] for key in difflib.get_close_matches(_letters(name), names, n=4)]
+    similar = [*dict.fromkeys([f"{mode.brand} {mode.model}" for mode in modes] or near)]
+    listed = ", ".join(similar[:4]) or "none"
+    more = f" and {len(similar) - 4} more" if len(similar) > 4 else ""
+    table = "table of readout times (rsvib cameras lists all)"
+    return ValueError(f"no camera {quoted(name)} in the {table}; similar: {listed}{more}")
 
 
 def camera_mode(name: str, *, width: int, height: int, frame_rate: float) -> CameraMode:
     """The mode of a camera model that fits the frames, with their size and rate.
 
-    It is the measured mode of the same rate (within 3 %), the same aspect and the nearest height. Frames of another
-    height, up to a factor of 1.6, are assumed to be scaled, and read in the same time (``measured_rows``).
+    It is the measured mode of the same size (within 1 %) and rate (within 3 %).
 
     Args:
         name: Complete name of the model, with or without brand and field of view.
@@ -176,8 +147,7 @@ def camera_mode(name: str, *, width: int, height: int, frame_rate: float) -> Cam
         >>> print(rsv.camera_mode("HERO6 Black", width=3840, height=2160, frame_rate=29.97))
         GoPro HERO6 Black, 3840 x 2160 px at 29.97/s: readout 8.34 ± 0.25 ms, 1 calibration
     """
-    rows = check_whole_number("height", height, at_least=1)
-    aspect = check_whole_number("width", width, at_least=1) / rows
+    size = check_whole_number("width", width, at_least=1), check_whole_number("height", height, at_least=1)
     rate = check_number("frame_rate", frame_rate, above=0.0)
     found = find_cameras(name)
     modes = [
@@ -187,29 +157,20 @@ def camera_mode(name: str, *, width: int, height: int, frame_rate: float) -> Cam
     ]
     if not modes:  # of "iPhone 7", "iPhone 7 Plus" is another camera
         raise _unknown(name, found)
-
-    def scale(mode: CameraMode) -> float:
-        return max(mode.height / rows, rows / mode.height)
-
-    sized = [
-        mode
-        for mode in modes
-        if math.isclose(mode.width / mode.height, aspect, rel_tol=_SAME_ASPECT) and scale(mode) <= _MAX_SCALE
-    ]
+    sized = [mode for mode in modes if np.allclose((mode.width, mode.height), size, rtol=_SAME_SIZE, atol=0.0)]
     fitting = [mode for mode in sized if math.isclose(mode.frame_rate, rate, rel_tol=_SAME_RATE)]
     if not fitting:
         known = ", ".join(
             f"{' '.join(filter(None, (mode.size, mode.lens)))} (readout {1e3 * mode.readout_time:.3g} ms)"
             for mode in sorted(modes, key=lambda mode: mode not in sized)
         )
-        # of 151 pairs of modes of one size with different rates, 96 have readout times within 5 %
         other = "try the readout time of a known rate, which is right for two of three cameras, or " if sized else ""
         raise ValueError(
-            f"no mode of {modes[0].brand} {modes[0].model} has the aspect, rate and nearly the size of "
-            f"{width} x {height} px at {rate:.4g}/s: {known}; {other}measure the row time (rsvib calibrate)"
+            f"no mode of {modes[0].brand} {modes[0].model} has the size and rate of {width} x {height} px at "
+            f"{rate:.4g}/s: {known}; {other}measure the row time (rsvib calibrate). Scaled frames take the readout "
+            "time of their mode: row_time is this time / their rows"
         )
-    best = [mode for mode in fitting if scale(mode) == min(map(scale, fitting))]
-    if len(names := dict.fromkeys(mode.name for mode in best)) > 1:
+    if len(names := dict.fromkeys(mode.name for mode in fitting)) > 1:
         raise ValueError(f"several modes fit, give the complete name: {', '.join(names)}")
-    mode = min(best, key=lambda mode: abs(mode.frame_rate - rate))
-    return replace(mode, width=width, height=rows, frame_rate=rate)
+    mode = min(fitting, key=lambda mode: abs(mode.frame_rate - rate))
+    return replace(mode, width=width, height=height, frame_rate=rate)

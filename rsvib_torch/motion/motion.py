@@ -32,8 +32,7 @@ class Motion(Result, ABC):
     implements the abstract members below. The last axis of every result counts the components: x and y in px, positive
     to the right and down, then roll in rad and zoom (relative) if there are three or four (``displacement_at``). Times
     have any shape S whose leading dimensions are the batch dimensions (or 1), in seconds since the exposure start of
-    row 0 of frame 0; results (S, axes) are float64, and differentiable except for bounds. A motion is an immutable
-    value.
+    row 0 of frame 0; results (S, axes) are float64, and differentiable except for bounds.
     """
 
     @property
@@ -131,22 +130,15 @@ class Motion(Result, ABC):
         return self.largest_oscillation() + self.drift(ends).detach().abs().amax(-2)
 
     def moving_axes(self) -> Tensor:
-        """Whether the motion moves the image along each axis, (..., axes) bool.
-
-        Example:
-            >>> from rsvib_torch import Vibration
-            >>> Vibration([2.0, 0.0], [50.0, 0.0], image_acceleration=[0.0, 3.0]).moving_axes().tolist()
-            [True, True]
-        """
+        """Whether the motion moves the image along each axis, (..., axes) bool."""
         return self.largest_displacement(-1.0, 1.0) > 0
 
     def to_row_order(self, timing: SensorTiming) -> Self:
         """The motion, given in image axes, as it appears in frames in row order, see ``row_axes``."""
-        order, signs = row_axes(timing, self.num_axes)
-        return self.with_axes(order, signs)
+        return self.with_axes(*row_axes(timing, self.num_axes))
 
     def from_row_order(self, timing: SensorTiming) -> Self:
-        """The motion, given in row order, in image axes: the inverse of ``to_row_order``."""
+        """The inverse of ``to_row_order``."""
         order, signs = row_axes(timing, self.num_axes)
         return self.with_axes(order, [signs[axis] for axis in order])
 
@@ -268,7 +260,7 @@ class ColumnMotion(Motion, shapes={"column": "..."}):
         return self._at_ends_of_rows(self.components.displacement_within(duration))
 
     def periods_within(self, duration: float) -> Tensor:
-        """Periods of the fastest tone in ``duration`` seconds, (..., 2)."""
+        """Periods of the fastest tone in ``duration`` seconds."""
         return self.components.periods_within(duration).amax(-1, keepdim=True).expand(*self.batch_shape, 2)
 
     def with_axes(self, order: Sequence[int], signs: Sequence[float]) -> Self:

@@ -13,7 +13,7 @@ from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.values import check_number
 from rsvib_torch.files.number_table import rows_of_numbers
 from rsvib_torch.files.reading import check_regular
-from rsvib_torch.motion.spline import FreeMotion
+from rsvib_torch.motion.spline import FreeMotion, check_increasing
 from rsvib_torch.options import MotionUnit
 from rsvib_torch.text import one_line
 
@@ -72,7 +72,10 @@ def read_motion(path: str | os.PathLike[str], *, unit: MotionUnit, focal_length:
             raise ValueError(f"unit={unit!r} needs a focal_length in px")
         check_number("focal_length", focal_length, above=0.0)
     times, values = _table(path)
-    check_times(path, times)
+    try:
+        check_times(times)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
     displacement = values if focal_length is None else _displacement(path, times, values, unit, focal_length)
     displacement = displacement - displacement.mean(0)
     spacing = float(np.median(np.diff(times)))
@@ -98,23 +101,15 @@ def _table(path: Path) -> tuple[Array, Array]:
     return table[:, 0], table[:, 1:]
 
 
-def check_times(path: Path, times: Array, longest_gap: float = 4.0) -> None:
+def check_times(times: Array, longest_gap: float = 4.0) -> None:
     """Raise a ValueError for times that do not increase, have gaps (in median steps), or are in another unit."""
+    check_increasing(times)
     steps = np.diff(times)
-    if (steps <= 0).any():
-        place = int(np.argmax(steps <= 0))
-        raise ValueError(
-            f"{path}: times must increase, but sample {place + 2} at {times[place + 1]:.9g} s comes after "
-            f"{times[place]:.9g} s"
-        )
-    typical = float(np.median(steps))
+    typical, place = float(np.median(steps)), int(np.argmax(steps))
     if not 1e-6 <= typical <= 0.5:  # s; motion sensors sample at 2 Hz to 1 MHz
-        raise ValueError(f"{path}: samples are {typical:.3g} s apart; times must be in s")
-    if steps.max() > longest_gap * typical:
-        place = int(np.argmax(steps))
-        raise ValueError(
-            f"{path}: gap of {steps[place]:.4g} s after {times[place]:.9g} s, samples are {typical:.4g} s apart"
-        )
+        raise ValueError(f"samples are {typical:.3g} s apart; times must be in s")
+    if steps[place] > longest_gap * typical:
+        raise ValueError(f"gap of {steps[place]:.4g} s after {times[place]:.9g} s, samples are {typical:.4g} s apart")
 
 
 def _displacement(path: Path, times: Array, values: Array, unit: str, focal_length: float) -> Array:

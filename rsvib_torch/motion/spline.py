@@ -16,6 +16,7 @@ from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import MAX_START_TIME, MIN_ROW_TIME
 from rsvib_torch.motion.vibration import TensorLike, Vibration
 from rsvib_torch.numerics.interpolation import bspline_coefficients, bspline_weights, gauss_legendre
+from rsvib_torch.numerics.tables import Array
 from rsvib_torch.results.presentation import axis_head, axis_rows
 from rsvib_torch.text import measured_text, text_table
 
@@ -138,10 +139,9 @@ class FreeMotion(
                 remedy = f"pass {name}.detach(), or evenly spaced times to through"
                 raise ValueError(f"from_samples has no gradient: {remedy}")
         _check_samples(grid, values)
-        steps = np.diff(grid.numpy())
-        if (steps <= 0).any():
-            raise ValueError("times must be strictly increasing")
-        step = 0.5 * float(np.median(steps)) if spacing is None else check_number("spacing", spacing, above=0.0)
+        check_increasing(grid.numpy())
+        usual = 0.5 * float(np.median(np.diff(grid.numpy())))
+        step = usual if spacing is None else check_number("spacing", spacing, above=0.0)
         first, last = float(grid[0]), float(grid[-1])
         if (last - first) / step > MAX_KNOTS:
             raise ValueError(f"spacing must give at most {MAX_KNOTS:,} knots, got {step:g} s for {last - first:g} s")
@@ -190,15 +190,7 @@ class FreeMotion(
         return replace(self, coefficients=self.coefficients + moved[..., None], start=self.start - offset, tones=tones)
 
     def within(self, first: float, last: float) -> "FreeMotion":
-        """The motion between two times in seconds, without the knots that have no influence there.
-
-        Example:
-            >>> times = torch.linspace(0, 1, 101, dtype=torch.float64)
-            >>> motion = FreeMotion.through(times, torch.stack([times, times.square()], -1))
-            >>> part = motion.within(0.42, 0.5)
-            >>> part.coefficients.shape[-1], round(float(part.displacement(torch.tensor(0.45))[1]), 4)
-            (11, 0.2025)
-        """
+        """The motion between two times in seconds, without the knots that have no influence there."""
         count = self.coefficients.shape[-1]
         low = min(max(math.floor((first - self.start) / self.spacing), 0), count - 4)
         high = min(max(math.ceil((last - self.start) / self.spacing) + 3, low + 4), count)
@@ -213,7 +205,7 @@ class FreeMotion(
         return type(self)(coefficients, self.start, self.spacing, self.tones.with_axes(order, signs), camera)
 
     def rest(self, times: Tensor) -> Tensor:
-        """R(t) alone in px; arguments and shapes as in ``displacement``."""
+        """R(t) alone in px."""
         times, batch = times.to(dtype=torch.float64, device=self.device), self.batch_shape
         knots = self.coefficients.shape[-1]
         # 1. The four knots about each time.
@@ -265,6 +257,16 @@ class FreeMotion(
     def periods_within(self, duration: float) -> Tensor:
         """Periods of the fastest tone in ``duration`` seconds, (..., 2)."""
         return self.tones.periods_within(duration)
+
+
+def check_increasing(times: Array) -> None:
+    """Raise a ValueError unless times (N,) in s increase."""
+    steps = np.diff(times)
+    if (steps <= 0).any():
+        place = int(np.argmax(steps <= 0))
+        raise ValueError(
+            f"times must increase, but sample {place + 2} at {times[place + 1]:.9g} s comes after {times[place]:.9g} s"
+        )
 
 
 def _check_samples(times: Tensor, displacement: Tensor) -> None:

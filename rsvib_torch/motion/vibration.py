@@ -75,11 +75,6 @@ def _per_axis(name: str, value: TensorLike, axes: int, device: torch.device | No
     return functional.pad(tensor, (0, axes - tensor.shape[-1]))
 
 
-def _with_trailing(value: float | Tensor, dimensions: int) -> float | Tensor:
-    """A number as it is, a tensor (S) with trailing dimensions of size 1."""
-    return value[(..., *(None,) * dimensions)] if isinstance(value, Tensor) else value
-
-
 def _check_values(values: dict[str, Tensor]) -> None:
     """Raise a ValueError for values that are not finite or too large, and for negative amplitudes or frequencies."""
     # one transfer: the smallest and the largest value of each quantity that is not empty, NaN if one is
@@ -208,14 +203,7 @@ class Vibration(
 
     @classmethod
     def stacked(cls, results: Sequence[Self]) -> Self:
-        """Vibrations with the same axes and camera as a batch; the new dimension is the first.
-
-        Those with fewer tones have further ones of amplitude 0.
-
-        Example:
-            >>> Vibration.stacked([Vibration(2.0, 50.0), Vibration(3.0, 40.0)]).amplitude.shape
-            torch.Size([2, 2, 1])
-        """
+        """Vibrations with the same axes and camera as a batch; missing tones have amplitude 0."""
         missing = [max(other.amplitude.shape[-1] for other in results) - one.amplitude.shape[-1] for one in results]
         return super().stacked(
             [
@@ -231,12 +219,7 @@ class Vibration(
         return replace(self, amplitude=self.amplitude * factors[..., None], **polynomial)
 
     def translation(self) -> "Vibration":
-        """The components x and y: the motion of the centre of the frame, without roll and zoom.
-
-        Example:
-            >>> Vibration((3.1, 5.2, 1e-3), (90.0, 61.0, 70.0)).translation().amplitude.flatten().tolist()
-            [3.1, 5.2]
-        """
+        """The components x and y: the motion of the centre of the frame, without roll and zoom."""
         tones = {name: getattr(self, name)[..., :2, :] for name in _QUANTITIES}
         return self._changed(**tones, **{name: getattr(self, name)[..., :2] for name in _POLYNOMIAL}, camera=None)
 
@@ -270,13 +253,13 @@ class Vibration(
         return torch.addcmul(phase, frequency, times[..., None, None], value=2 * math.pi), amplitude, frequency
 
     def drift(self, times: Tensor) -> Tensor:
-        """Displacement v t + a t^2 / 2 of the image motion alone in px; arguments and shapes as in ``displacement``."""
+        """Displacement v t + a t^2 / 2 of the image motion alone in px."""
         times = times.to(dtype=torch.float64, device=self.device)
         velocity, acceleration = self._at(times, self.image_motion), self._at(times, self.image_acceleration)
         return torch.addcmul(velocity, acceleration, times[..., None], value=0.5) * times[..., None]
 
     def displacement(self, times: Tensor) -> Tensor:
-        """Displacement D(t) in px (Eq. 1), float64 (S, axes), at times of shape S as in ``Motion.displacement``."""
+        """Displacement D(t) in px (Eq. 1), as in ``Motion.displacement``."""
         times = times.to(dtype=torch.float64, device=self.device)
         angle, amplitude, _ = self._angle(times)
         return (amplitude * angle.sin()).sum(-1) + self.drift(times) + self._at(times, self.image_shift)
@@ -288,10 +271,11 @@ class Vibration(
         """
         check_broadcast(starts=starts, exposure_time=exposure_time)
         middle = starts.to(dtype=torch.float64, device=self.device) + 0.5 * exposure_time
+        exposure = exposure_time[..., None] if isinstance(exposure_time, Tensor) else exposure_time
         angle, amplitude, frequency = self._angle(middle)
-        attenuation = torch.sinc(frequency * _with_trailing(exposure_time, 2))
+        attenuation = torch.sinc(frequency * (exposure[..., None] if isinstance(exposure, Tensor) else exposure))
         tones = (amplitude * attenuation * angle.sin()).sum(-1)
-        curvature = self._at(middle, self.image_acceleration) * (_with_trailing(exposure_time, 1) ** 2 / 24)
+        curvature = self._at(middle, self.image_acceleration) * (exposure**2 / 24)
         return tones + self.drift(middle) + curvature + self._at(middle, self.image_shift)
 
     def gain(self, interval: float) -> Tensor:

@@ -418,7 +418,7 @@ _ROW_TIME = {
         "number of frames, below 3",
     ),
     "no_motion_for_row_time": _of_result(
-        "no vibration, and no motion of a hand in 21 frames or more, determines the row time",
+        "no vibration determines the row time",
         "shake the camera while it records, use more frames, and leave out what is fixed to the frames or moves by "
         "itself (ignore)",
     ),

@@ -1,13 +1,9 @@
 """``calibrate_row_time_by_motion``: row time and readout direction of a camera from the motion in its frames.
 
-Tones are fitted in ``by_tones.py``, the path of a hand in ``by_path.py``.
-
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
-import math
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Literal, ParamSpec, Protocol
 
 from pydantic import Field
@@ -22,12 +18,12 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import MaskedInputOptions, RegistrationOptions
 from rsvib_torch.results.reason import Reason
 from rsvib_torch.row_time import RowTimeCalibration
-from rsvib_torch.row_time.by_path import row_time_of_path
-from rsvib_torch.row_time.by_tones import CameraClock, RowTimeFit, row_time_of_tones
+from rsvib_torch.row_time.by_tones import CameraClock, Candidate, row_times_of_tones
 
 P = ParamSpec("P")
 
 _MIN_FRAMES = 3  # two frames determine the product of row time and frequency only
+_MAX_STD = 0.01  # of the row time, standard deviation of a certain result; frequencies have the same relative error
 _SHORTEST_READOUT = 0.1  # of the frame period, if no row times are given
 
 
@@ -70,8 +66,7 @@ def calibrate_row_time_by_motion(frames: FramesOrFiles, options: RowTimeOptions)
     A tone of frequency f advances by ``f T_row`` cycles from row to row, and by ``f P`` cycles, of which the whole
     number k is unknown, from frame to frame of known period P. One tone therefore has one row time for each k; two
     tones of unrelated frequencies have one row time in common. The displacements of rows are measured on the images,
-    and the row time is fitted together with all parameters of the tones. Without tones, a hand that holds the camera
-    determines the row time in 21 frames and more: one path explains corners in all rows, also with roll and parallax.
+    and the row time is fitted together with all parameters of the tones.
 
     The result is reliable only if a single row time within the given limits, and a single readout direction, explains
     the frames. Other row times that explain them are listed in ``candidates``.
@@ -111,24 +106,37 @@ def calibrate_row_time_by_motion(frames: FramesOrFiles, options: RowTimeOptions)
         raise ValueError(f"calibrate_row_time_by_motion takes one stack, got a batch of {len(stack.images)}")
     num_frames, num_rows = stack.images.shape[1:3]
     low, high = _limits(options.row_time, period, num_rows)
-    directions = {None: (1.0, -1.0), "forward": (1.0,), "reverse": (-1.0,)}[options.readout_direction]
-    clock = CameraClock(period, num_rows, low, high, directions, exposure)
-    notes = []
-    if options.row_time is None:
-        notes.append(
-            f"row times of {1e6 * low:.3f} to {1e6 * high:.3f} us were considered, a readout within a tenth to the "
-            "whole of the frame period; pass row_time=(low, high) for other ones"
-        )
-    if num_frames < _MIN_FRAMES:
-        found = RowTimeFit(findings=(Reason("too_few_frames_for_row_time", None, num_frames, _MIN_FRAMES),))
-    else:
+    signs = {None: (1.0, -1.0), "forward": (1.0,), "reverse": (-1.0,)}[options.readout_direction]
+    clock = CameraClock(period, low, high, signs, exposure or 0.0)
+    # 1. The row times that agree with the tones, and the reasons against them.
+    found, reasons = list[Candidate](), [Reason("too_few_frames_for_row_time", None, num_frames, _MIN_FRAMES)]
+    if num_frames >= _MIN_FRAMES:
         with threads_for(stack.images):
-            found = row_time_of_tones(stack, clock, options) or RowTimeFit(findings=(Reason("no_motion_for_row_time"),))
-            by_path = row_time_of_path(stack, clock) if found.findings else None
-            if by_path is not None:
-                found = by_path
-                notes.append("the motion is that of a hand or a flight: the path of corners over all rows")
-    return _result(replace(found, findings=reasons_from_row_order(found.findings, sensor)), clock, notes)
+            found, reasons = row_times_of_tones(stack, clock, options)
+        reasons += [] if found else [Reason("no_motion_for_row_time")]
+    if len(found) > 1:
+        listed = ", ".join(f"{1e6 * one.row_time:.4f}" for one in found[1:9])
+        details: dict[str, float | str] = {"row_time": 1e6 * found[0].row_time, "others": listed}
+        reasons.append(Reason("row_times_ambiguous", None, len(found), 1, details))
+    row_time, std = (abs(found[0].row_time), found[0].std) if found else (None, None)
+    if row_time is not None and std is not None and std > _MAX_STD * row_time:
+        reasons.append(Reason("row_time_uncertain", None, std / row_time, _MAX_STD))
+    # 2. The result; the readout direction if all of them have the same.
+    directions: set[Literal["forward", "reverse"]] = {"forward" if one.row_time > 0 else "reverse" for one in found}
+    notes = (
+        f"row times of {1e6 * low:.3f} to {1e6 * high:.3f} us were considered, a readout within a tenth to the "
+        "whole of the frame period; pass row_time=(low, high) for other ones",
+    )
+    return RowTimeCalibration(
+        row_time=row_time,
+        row_time_std=std,
+        frame_rows=None if row_time is None else period / row_time,
+        readout_direction=directions.pop() if len(directions) == 1 else None,
+        notes=notes if options.row_time is None else (),
+        candidates=tuple(sorted(one.row_time for one in found)),
+        reliable=not reasons,
+        findings=reasons_from_row_order(tuple(reasons), sensor),
+    )
 
 
 def _limits(row_time: tuple[float, float] | None, period: float, num_rows: int) -> tuple[float, float]:
@@ -145,26 +153,3 @@ def _limits(row_time: tuple[float, float] | None, period: float, num_rows: int) 
             f"row times are in seconds, and at most {longest:.4g}"
         )
     return low, min(high, longest)
-
-
-def _result(found: RowTimeFit, clock: CameraClock, notes: list[str]) -> RowTimeCalibration:
-    findings = list(found.findings)
-    known = math.isfinite(found.row_time)
-    if found.others:
-        listed = ", ".join(f"{1e6 * one.row_time:.4f}" for one in found.others[:8])
-        details: dict[str, float | str] = {"row_time": 1e6 * found.row_time, "others": listed}
-        findings.append(Reason("row_times_ambiguous", None, len(found.others) + 1, 1, details))
-    if known and found.std > found.permitted * abs(found.row_time):
-        findings.append(Reason("row_time_uncertain", None, found.std / abs(found.row_time), found.permitted))
-    directions: tuple[Literal["forward", "reverse"], ...] = ("forward", "reverse")
-    signs = {one.row_time > 0 for one in found.others} | {found.row_time > 0}
-    return RowTimeCalibration(
-        row_time=abs(found.row_time) if known else None,
-        row_time_std=found.std if known else None,
-        frame_rows=clock.period / abs(found.row_time) if known else None,
-        readout_direction=directions[found.row_time < 0] if known and len(signs) == 1 else None,
-        notes=tuple(notes),
-        candidates=tuple(sorted((found.row_time, *(one.row_time for one in found.others)))) if known else (),
-        reliable=not findings,
-        findings=tuple(findings),
-    )

@@ -62,28 +62,15 @@ class Candidate:
     chi_square: float  # of the distances of ``nu P / T_row - phi`` of the tones from whole numbers
 
 
-@dataclass(frozen=True, eq=False)
-class RowTimeFit:
-    """Row time of the frames of one stack."""
-
-    row_time: float = math.nan  # seconds, negative for a reverse readout; NaN if it is not determined
-    std: float = math.nan  # its standard deviation
-    others: tuple[Candidate, ...] = ()  # other row times that explain the frames as well
-    findings: tuple[Reason, ...] = ()  # reasons why the row time is not certain
-    # largest standard deviation over the row time of a certain result; frequencies have the same relative error
-    permitted: float = 0.01
-
-
 @dataclass(frozen=True)
 class CameraClock:
     """What is known about the timing of a camera."""
 
     period: float  # frame period in s
-    num_rows: int  # rows of a frame
     low: float  # shortest possible row time in s
     high: float  # longest possible row time in s
     directions: tuple[float, ...]  # possible readout directions: 1.0 forward, -1.0 reverse
-    exposure_time: float | None  # in s; None if unknown
+    exposure_time: float  # in s; 0 if unknown
 
     def allows(self, row_time: float) -> bool:
         """Whether a signed row time in s is possible."""
@@ -138,13 +125,6 @@ class _Tones:
     def tones(self) -> Array:
         """(K, 4) parameters of the tones."""
         return self.values[:-1].reshape(-1, 4)
-
-    @property
-    def covariance_of_frequencies(self) -> Array:
-        """(2 K, 2 K) of nu of all tones, then of phi."""
-        first = 4 * np.arange(len(self.tones))
-        index = np.concatenate([first + 2, first + 3])
-        return self.covariance[np.ix_(index, index)]
 
 
 def _fitted(rows: _MeasuredRows, axis: int, start: Array) -> _Tones:
@@ -232,8 +212,9 @@ def _motion(tones: list[_Tones], timing: RowTiming, num_frames: int, num_rows: i
 def candidates(tones: list[_Tones], clock: CameraClock) -> list[Candidate]:
     """All possible row times that are a local minimum of chi-square, the best first."""
     nu, phi = np.concatenate([one.tones[:, 2:] for one in tones]).T
-    covariances = [one.covariance_of_frequencies.reshape(2, len(one.tones), 2, len(one.tones)) for one in tones]
-    of_nu, mixed, of_phi = (block_diag(*(one[i, :, j] for one in covariances)) for i, j in ((0, 0), (0, 1), (1, 1)))
+    of_nu, mixed, of_phi = (
+        block_diag(*(one.covariance[i:-1:4, j:-1:4] for one in tones)) for i, j in ((2, 2), (2, 3), (3, 3))
+    )
 
     # 1. Values of P / T_row with which a tone has a whole number of further turns per frame.
     most = math.ceil(float(np.abs(nu).max(initial=0.0)) * clock.period / clock.low) + 1
@@ -267,8 +248,13 @@ def candidates(tones: list[_Tones], clock: CameraClock) -> list[Candidate]:
     return sorted(found, key=lambda candidate: candidate.chi_square)
 
 
-def row_time_of_tones(stack: GreyFrames, clock: CameraClock, options: RegistrationOptions) -> RowTimeFit | None:
-    """Row time from the tones in the motion of one stack in image order; None if there is no tone."""
+def row_times_of_tones(
+    stack: GreyFrames, clock: CameraClock, options: RegistrationOptions
+) -> tuple[list[Candidate], list[Reason]]:
+    """Row times that agree with the tones of one stack in image order, the best first, and reasons against all of them.
+
+    There are none without tones.
+    """
     num_frames, num_rows = stack.images.shape[1:3]
 
     # 1. The tones of row bands.
@@ -277,24 +263,22 @@ def row_time_of_tones(stack: GreyFrames, clock: CameraClock, options: Registrati
     bands = _MeasuredRows.of(measurements_of_curve(curve, timing, options.band_step), num_frames, num_rows, 0.0)
     highest = 0.5 / options.band_step
     tones = [_found(bands, axis, highest, _SHARE_OF_BANDS, np.zeros(1)) for axis in range(2)]
-    if not any(len(one.tones) for one in tones):
-        return None
-    possible = candidates(tones, clock)
+    possible = candidates(tones, clock) if any(len(one.tones) for one in tones) else []
     if not possible:
-        return None
+        return [], []
 
     # 2. The tones of rows, which are measured around the motion. Which rows an exposure blurs depends on the row time:
     # of those that agree with the tones, the longest one blurs least.
     for number in range(_ROUNDS):
         row_time = max((one.row_time for one in _explaining(possible, _PROBABLE)), key=abs)
-        exposed = max(1.0, (clock.exposure_time or 0.0) / abs(row_time))
+        exposed = max(1.0, clock.exposure_time / abs(row_time))
         timing = replace(timing, exposure_rows=exposed)
         motion = _motion(tones, timing, num_frames, num_rows).to(stack.images.device)
         if number == 0:
             frames = grouped_frames(stack.images, stack.valid, timing, motion)
         measured = replace(frames, timing=timing).measure(motion)
         if not (measured.measurements.weights > 0).any():
-            return None
+            return [], []
         if number == _ROUND_OF_PATTERN and (pattern := frames.column_pattern(motion, measured.row_variance())).any():
             frames = frames.without(pattern)
             measured = replace(frames, timing=timing).measure(motion)
@@ -307,7 +291,7 @@ def row_time_of_tones(stack: GreyFrames, clock: CameraClock, options: Registrati
         ]
         possible = candidates(tones, clock)
         if not possible:
-            return None
+            return [], []
         left = float(rows.measurements.unexplained(rows.residual(tones)).max())
         if number > 1 and (all(map(_is_converged, before, tones)) or left > _HOPELESS):
             break
@@ -315,10 +299,10 @@ def row_time_of_tones(stack: GreyFrames, clock: CameraClock, options: Registrati
     # 3. The row times that agree with the tones, and the verdict.
     best, *others = _explaining(possible, _MAX_CHI_SQUARE)
     others = [one for one in others if abs(one.row_time - best.row_time) > 5 * (one.std + best.std)]
-    findings = _findings(rows, tones, measured.differential())
+    reasons = _findings(rows, tones, measured.differential())
     if best.chi_square > _MAX_CONTRADICTION:
-        findings = (*findings, Reason("row_time_contradicted", None, best.chi_square, _MAX_CONTRADICTION))
-    return RowTimeFit(best.row_time, best.std, tuple(others), findings)
+        reasons.append(Reason("row_time_contradicted", None, best.chi_square, _MAX_CONTRADICTION))
+    return [best, *others], reasons
 
 
 def _explaining(possible: list[Candidate], further: float) -> list[Candidate]:
@@ -331,7 +315,7 @@ def _is_converged(before: _Tones, after: _Tones) -> bool:
     return bool((np.abs(change) <= _CONVERGED * np.sqrt(after.covariance.diagonal())).all())
 
 
-def _findings(rows: _MeasuredRows, tones: list[_Tones], differential: Array) -> tuple[Reason, ...]:
+def _findings(rows: _MeasuredRows, tones: list[_Tones], differential: Array) -> list[Reason]:
     """Reasons against tones, and with them against their row time."""
     residual, measured, reasons = rows.residual(tones), rows.measurements, list[Reason]()
     of_tones = [replace(one, values=np.append(one.values[:-1], 0.0)) for one in tones]
@@ -341,4 +325,4 @@ def _findings(rows: _MeasuredRows, tones: list[_Tones], differential: Array) -> 
         names = ("unexplained", "correlated", "size", "permitted")
         numbers = {quantity: float(quantities[quantity][0, axis]) for quantity in names}
         reasons += with_remedy(residual_reasons(name, numbers), "use frames in which the vibration is steady")
-    return tuple(reasons)
+    return reasons

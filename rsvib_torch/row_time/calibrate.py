@@ -83,9 +83,9 @@ def calibrate_row_time(
 ) -> RowTimeCalibration:
     """Row time from frames of a light that flickers at a known frequency: ``T_row = 1 / (f P)``, bands of P rows.
 
-    The brightness of the rows is fitted as that of the scene times a waveform that repeats every P rows, with the
-    number of harmonics that maximises the evidence. Shading along the rows is part of the fit; several frames of a
-    still scene whose bands lie at different rows eliminate its texture.
+    The brightness of the rows is fitted as that of the scene times a waveform that repeats every P rows. Shading along
+    the rows is part of the fit; several frames of a still scene whose bands lie at different rows eliminate its
+    texture.
 
     Bands do not show the readout direction: it is that of most cameras, ``"forward"``, unless detection names another
     one, see ``detect_vibration``.
@@ -120,15 +120,7 @@ def calibrate_row_time(
             f"{MIN_PERIODS:g} periods fit into one; use a faster flicker"
         )
     profiles = row_profiles(frames, scan_axis, full_scale, channels)
-    try:
-        bands, scene = find_bands(profiles)
-    except ValueError as error:
-        other: ScanAxis = "y" if scan_axis in (-1, "x") else "x"
-        try:
-            find_bands(row_profiles(frames, other, full_scale, channels))
-        except ValueError:
-            raise error from None
-        raise ValueError(f"there are bands along the other axis of the frames: pass scan_axis={other!r}") from error
+    bands, scene = find_bands(profiles)
     height = profiles.rows.shape[1]
     row_time = 1 / (frequency * bands.period)
     notes: list[str] = []

@@ -19,6 +19,8 @@ from rsvib_torch.numerics.tables import Array
 SceneModel = Literal["smooth", "fixed"]
 _TINY = 1e-300  # smallest divisor
 MIN_PERIODS = 1.5  # that a frame must contain
+_HARMONICS = 16  # at most, of the light; with 8, the row time of an LED in front of a texture was wrong by 0.2 %
+_CERTAIN = 50.0  # least ``BandFit.certainty``; that of texture stays below it on drawn scenes
 _MIN_PERIOD = 4.0  # rows; shorter bands may be aliases of longer ones
 
 
@@ -60,7 +62,7 @@ class BandFit:
     coefficients: Array  # (T, K) complex128, waveform of each frame over its mean
     # power of the fundamental over that of residuals at frequencies beside it, in all frames of a fixed scene together
     certainty: float
-    evidence: float  # Gaussian log-likelihood less half the number of parameters times log N (BIC)
+    residual: float  # mean square of the residual of the rows over their brightness
 
     @property
     def moves(self) -> bool:
@@ -92,31 +94,27 @@ def _unexplained(matrix: Array, values: Array) -> Array:
     return values - (matrix @ _solve(matrix, values)[..., None])[..., 0]
 
 
-def _fit_period(brightness: Array, start: float, scene: SceneModel) -> BandFit | None:
-    """Fit bands to the brightness (T, H) of rows, with the number of harmonics that maximises the evidence.
+def _fit_bands(brightness: Array, start: float, scene: SceneModel) -> BandFit | None:
+    """Fit bands to the brightness (T, H) of rows; None if there are none with a period near ``start``.
+
+    The fundamental alone must be certain: many harmonics of a long period explain texture.
+    """
+    rough = _fit(brightness, start, scene, 1)
+    if rough is None or rough.certainty <= _CERTAIN:
+        return None
+    found = _fit(brightness, rough.period, scene, max(1, min(_HARMONICS, int(rough.period / 4))))
+    return found if found is not None and found.certainty > _CERTAIN else None
+
+
+def _fit(brightness: Array, start: float, scene: SceneModel, count: int) -> BandFit | None:
+    """Fit a number of harmonics to the brightness (T, H) of rows; None if the period changes by more than a quarter.
 
     The brightness of a ``"smooth"`` scene is a polynomial along the rows, one for each frame; that of a ``"fixed"``
-    scene has a texture of the rows as well, which is the same in all frames. None if the fit diverges.
+    scene has a texture of the rows as well, which is the same in all frames. Gauss-Newton finds period, waveforms and
+    smooth scene together, and the texture in turn.
     """
-    best: BandFit | None = None
-    worse = 0  # numbers in a row; a square wave has no even harmonics
-    for count in (1, 2, 3, 5, 8, 12, 16):
-        if count > 1 and count > start / 4:
-            break
-        found = _fit(brightness, best.period if best else start, scene, count)
-        if found is None or abs(found.period / start - 1) > 0.25:
-            break
-        worse = 0 if best is None or found.evidence > best.evidence else worse + 1
-        if worse == 2:
-            break
-        if worse == 0:
-            best = found
-    return best
-
-
-def _fit(brightness: Array, period: float, scene: SceneModel, count: int) -> BandFit | None:
-    """Gauss-Newton on period, waveforms and smooth scene together, and on the texture in turn."""
     frames, height = brightness.shape
+    period = start
     centre = 0.5 * (height - 1)
     rows = np.arange(height) - centre
     order = np.arange(1, count + 1)
@@ -151,7 +149,7 @@ def _fit(brightness: Array, period: float, scene: SceneModel, count: int) -> Ban
         period += max(-0.05 * period, min(0.05 * period, step))
         waves = waves + change[:, : 2 * count]
         level = np.maximum(level + change[:, 2 * count :] @ smooth.T, floor)
-        if not math.isfinite(period) or not 2.0 <= period <= 2 * height:
+        if not abs(period / start - 1) <= 0.25:
             return None
         if turn > 8 and abs(step) < 1e-8 * period:
             break
@@ -167,25 +165,13 @@ def _fit(brightness: Array, period: float, scene: SceneModel, count: int) -> Ban
     certainty = _certainty(coefficients, residual, period)
     if scene == "smooth":  # its texture is the same in all frames
         certainty /= frames
-    values = brightness.size / _correlation_rows(residual)  # independent ones
-    evidence = -0.5 * values * math.log(float((residual**2).mean()) + _TINY)
     return BandFit(
         period=period,
         period_std=_period_std_beside(leverage, shift, certainty, period),
         coefficients=coefficients,
         certainty=certainty,
-        evidence=evidence - 0.5 * 2 * count * frames * math.log(values),
+        residual=float((residual**2).mean()),
     )
-
-
-def _correlation_rows(residual: Array) -> float:
-    """Correlation length of the residuals in rows: ``1 + 2 sum rho(k)`` up to the first rho below 0.05."""
-    length = residual.shape[1]
-    power = (np.abs(np.fft.rfft(residual, n=2 * length)) ** 2).sum(0)
-    covariance = np.fft.irfft(power)[:length]
-    ratio = covariance / max(covariance[0], _TINY)
-    below = np.flatnonzero(ratio < 0.05)
-    return max(1.0, float(1 + 2 * ratio[1 : below[0] if len(below) else length].sum()))
 
 
 def _period_std_beside(leverage: Array, shift: Array, certainty: float, period: float) -> float:
@@ -245,21 +231,24 @@ def find_bands(profiles: Profiles) -> tuple[BandFit, SceneModel]:
         scenes.append(("fixed", even - even.mean(0) + 1.0))
     trusted: list[tuple[BandFit, SceneModel]] = []
     for scene, curve in scenes:
-        fits = [_fit_period(brightness, start, scene) for start in _starts(curve)]
-        usable = [fit for fit in fits if fit is not None and fit.period <= brightness.shape[1]]
-        if scene == "fixed":  # a pattern at the same rows in all frames is texture
-            usable = [fit for fit in usable if fit.moves]
-        # the certainty of texture stays below 50 on drawn scenes
-        usable = [fit for fit in usable if fit.certainty > 50.0 and np.abs(fit.coefficients[:, 0]).max() > 2e-3]
-        usable = [fit for fit in usable if not fit.is_multiple]
-        usable = [fit for fit in usable if _same_everywhere(profiles, fit, scene)]
+        fits = [_fit_bands(brightness, start, scene) for start in _starts(curve)]
+        usable = [
+            fit
+            for fit in fits
+            if fit is not None
+            and fit.period <= brightness.shape[1]
+            and (scene == "smooth" or fit.moves)  # a pattern at the same rows in all frames is texture
+            and np.abs(fit.coefficients[:, 0]).max() > 2e-3
+            and not fit.is_multiple
+            and _same_everywhere(profiles, fit, scene)
+        ]
         if usable:
-            trusted.append((max(usable, key=lambda fit: fit.evidence), scene))
+            trusted.append((min(usable, key=lambda fit: fit.residual), scene))
     if not trusted:
         raise ValueError(
             "no flicker found: no bands of the same period across all columns exceed the texture of the scene; at "
             f"least {MIN_PERIODS:g} periods of the flicker must fit into a frame with visible contrast; two or more "
-            "frames of a still scene eliminate its texture"
+            "frames of a still scene eliminate its texture; vertical bands need scan_axis='x'"
         )
     best, model = min(trusted, key=lambda item: item[0].period_std / item[0].period)
     if best.period < _MIN_PERIOD:
@@ -270,7 +259,7 @@ def find_bands(profiles: Profiles) -> tuple[BandFit, SceneModel]:
     if brightness.shape[1] / best.period < MIN_PERIODS:
         raise ValueError(
             f"flicker is slower than a frame: {brightness.shape[1] / best.period:.2f} periods in its rows, at least "
-            f"{MIN_PERIODS:g} are needed; use a faster flicker"
+            f"{MIN_PERIODS:g} are needed; use a faster flicker; vertical bands need scan_axis='x'"
         )
     return best, model
 

@@ -171,7 +171,10 @@ def test_pixels_beyond_all_scales(value):
         (lambda: free(torch.full((2, 8), torch.nan)), "finite"),
         (lambda: free(torch.zeros(2, 8), rsv.Vibration.still((3,))), "batch shape"),
         (lambda: rsv.FreeMotion.through([0.0, 1.0, 2.0, 4.0], torch.zeros(4, 2)), "evenly spaced"),
-        (lambda: rsv.FreeMotion.from_samples([0.0, 1.0, 1.0, 4.0], torch.zeros(4, 2)), "strictly increasing"),
+        (
+            lambda: rsv.FreeMotion.from_samples([0.0, 1.0, 1.0, 4.0], torch.zeros(4, 2)),
+            "times must increase",
+        ),
         (lambda: rsv.Camera(500.0, distortion=(0.1, 0.2)), "distortion must be 5 numbers"),
         (lambda: rsv.Camera(500.0, distortion=(0.1,) * 5, fisheye=True), "distortion must be 4 numbers"),
         (lambda: rsv.register_bands(FRAMES, TIMING, search=60), "frames of 96 x 64 px .* of 32 rows searched over 60"),

@@ -186,3 +186,9 @@ def test_simulated_frames_equal_those_of_the_independent_simulator():
     scene = draw_scene(320 + 2 * MARGIN, 192 + 2 * MARGIN, 2)
     frames = rsv.simulate_frames(torch.from_numpy(scene), LONG_EXPOSURES, NATURAL, 2, frame_size=(320, 192))
     assert decibel(frames.numpy(), take_frames(scene, LONG_EXPOSURES, Curve(SPLINE), 2), rim=16) > 60
+
+
+def test_a_part_of_a_spline_has_the_knots_that_it_needs():
+    part, times = NATURAL.within(0.042, 0.05), torch.linspace(0.042, 0.05, 30, dtype=torch.float64)
+    assert part.coefficients.shape[-1] < 15
+    torch.testing.assert_close(part.displacement(times), NATURAL.displacement(times))

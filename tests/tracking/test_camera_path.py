@@ -335,15 +335,9 @@ def test_the_smooth_path_keeps_slow_motion_and_the_limit():
     assert not shifts(0.0, 0.1).any()
 
 
-@pytest.mark.parametrize("direction", ["forward", "reverse"])
-def test_the_path_of_a_hand_determines_the_row_time(direction):
+def test_a_hand_does_not_determine_the_row_time():
     """The frames have parallax, a subject, roll and zoom, and no vibration."""
-    frames = np.stack(recorded({}, count=32))
-    frames = frames if direction == "forward" else frames[:, ::-1]
-    found = calibrate_row_time_by_motion(frames, frame_rate=RATE)
-    assert found.reliable
-    assert found.readout_direction == direction
-    assert abs(found.row_time - TIMING.row_time) < 3 * found.row_time_std < 0.1 * TIMING.row_time
+    assert not calibrate_row_time_by_motion(np.stack(recorded({}, count=12)), frame_rate=RATE).reliable
 
 
 def test_a_single_tone_does_not_determine_the_row_time():
