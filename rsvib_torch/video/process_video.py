@@ -31,9 +31,8 @@ from rsvib_torch.stacks.manifest import fingerprint, manifest_header, rms_shakin
 from rsvib_torch.stacks.memory import share_one_heap
 from rsvib_torch.stacks.run_folder import FileRun, RunFolder, StackReport
 from rsvib_torch.video import Margins
-from rsvib_torch.video.first_pass import PART_FRAMES
 from rsvib_torch.video.video_frames import Frame, FrameTrack, VideoFrames
-from rsvib_torch.video.video_passes import VideoMotion, VideoPart, shakes_more, video_motion
+from rsvib_torch.video.video_motion import PART_FRAMES, VideoMotion, VideoPart, shakes_more, video_motion
 
 _TOGETHER = ("joint", "scale", "mosaic", "optics")  # options of restore that frames one by one do not have
 
