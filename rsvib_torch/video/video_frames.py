@@ -101,43 +101,32 @@ class VideoFrames:
         return [np.full((height, width), 16, np.uint8), np.full((2, height // 2, width // 2), 128, np.uint8)]
 
     def restored(self, frame: Frame, track: FrameTrack) -> list[Frame]:
-        """Planes of a restored frame, as taken if it could not be used."""
-        planes, method = self.planes(frame), self.job.chosen.method
-        if track.fault is not None or not bool(track.motion.moving_axes().any()):
-            return planes
-        results: list[Frame] = []
-        for number, plane in enumerate(planes):
-            motion = track.motion if number == 0 else _on_half_pixels(track.motion)
-            timing = self.timing_of(number, track.index)
-            separately = number == 0 and method != "dewarp"
-            if separately and isinstance(motion, Vibration) and bool((motion.amplitude > 0).any()):
-                # The method undoes what varies between the rows along x and y, and the rest is moved afterwards.
-                rowwise = motion.translation()
-                plane = self._without_vibration(plane, timing, replace(rowwise, image_shift=torch.zeros(2)))  # noqa: PLW2901
-                rest = {name: getattr(motion, name).clone() for name in ("image_motion", "image_acceleration")}
-                for values in rest.values():
-                    values[:2] = 0.0
-                motion = replace(motion, amplitude=torch.zeros_like(motion.amplitude), **rest)
-            size = plane.shape[-2:]
-            results.append(_with_pixels_moved(plane, places(*recorded_offsets(motion, timing, size), timing, size)))
-        return results
+        """Planes of a restored frame."""
+        (luma, *chroma), motion, timing = self.planes(frame), track.motion, self.timing_of(track.index)
+        if not bool(motion.moving_axes().any()):
+            return [luma, *chroma]
+        source = places(*recorded_offsets(motion, timing, self.size), timing, self.size)
+        for number, plane in enumerate(chroma):
+            # its pixels have the mean place of four pixels of luma, in pixels that are twice as large
+            halves = [0.5 * cv2.resize(at, plane.shape[:0:-1], interpolation=cv2.INTER_AREA) - 0.25 for at in source]
+            chroma[number] = _with_pixels_moved(plane, np.stack(halves))
+        if self.job.chosen.method != "dewarp" and isinstance(motion, Vibration) and bool((motion.amplitude > 0).any()):
+            # The method undoes what varies between the rows along x and y, and the rest is moved afterwards.
+            luma = self._without_vibration(luma, timing, replace(motion.translation(), image_shift=torch.zeros(2)))
+            rest = {name: getattr(motion, name).clone() for name in ("image_motion", "image_acceleration")}
+            for values in rest.values():
+                values[:2] = 0.0
+            motion = replace(motion, amplitude=torch.zeros_like(motion.amplitude), **rest)
+            source = places(*recorded_offsets(motion, timing, self.size), timing, self.size)
+        return [_with_pixels_moved(luma, source), *chroma]
 
-    def timing_of(self, plane: int, index: int) -> SensorTiming:
-        """Timing of a plane of a frame, with the time origin in its middle; rows of chroma lie between two of luma."""
+    def timing_of(self, index: int) -> SensorTiming:
+        """Timing of a frame, with the time origin in its middle."""
         timing = self.job.timing
         if self.exposures is not None:
             rows = float(self.exposures[index]) / timing.row_time
             timing = replace(timing, exposure_rows=min(rows, timing.frame_rows))
-        half = timing.time_to_middle(self.size[int(timing.scan_axis)])  # of this frame
-        if plane == 0:
-            return replace(timing, frame_start_times=(-half,))
-        return replace(
-            timing,
-            row_time=2.0 * timing.row_time,
-            exposure_rows=0.5 * timing.exposure_rows,
-            frame_rows=0.5 * timing.frame_rows,
-            frame_start_times=(0.5 * timing.row_time - half,),
-        )
+        return replace(timing, frame_start_times=(-timing.time_to_middle(self.size[int(timing.scan_axis)]),))
 
     def _without_vibration(self, plane: Frame, timing: SensorTiming, motion: Vibration) -> Frame:
         scale, options = self.job.options.full_scale if self.picture is None else 255.0, self.job.chosen
@@ -168,12 +157,3 @@ def _with_pixels_moved(plane: Frame, source: NDArray[np.float32]) -> Frame:
         limits = np.iinfo(plane.dtype)
         moved = np.clip(np.rint(moved), limits.min, limits.max)
     return moved.reshape(plane.shape).astype(plane.dtype, copy=False)
-
-
-def _on_half_pixels(motion: Vibration | FreeMotion) -> Vibration | FreeMotion:
-    """The motion in pixels of chroma, which are twice as large; roll and zoom are the same."""
-    factors = torch.tensor([0.5, 0.5, 1.0, 1.0][: motion.num_axes], dtype=torch.float64)
-    if isinstance(motion, Vibration):
-        return motion.scaled(factors)
-    camera = motion.camera and motion.camera.scaled(0.5)
-    return FreeMotion(motion.coefficients * factors[:, None], motion.start, motion.spacing, camera=camera)

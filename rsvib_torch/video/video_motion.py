@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -37,9 +37,6 @@ CHECKED_FRAMES = 8  # of each part, in which the shaking is measured
 # Of the usual change from frame to frame: at least 0.18 in 36 clips that a hand holds, and at most 0.12 of copies in a
 # video of 24 frames per second that is stored as 30. More frames in a row are no copies: a pan has ended, or it is dark
 _COPY, _MEMORY, _MOST_IN_A_ROW = 0.15, 8, 3
-# Of the contrast of two frames of 16 x 16 px, their mean difference: at least 0.9 at 14 cuts, at most 0.7 in 13 clips.
-# Light that flickers more leaves many corners; those of unrelated frames that agree by chance are few
-_CUT, _THUMBNAIL, _FEW = 0.8, (16, 16), 64
 # Of the distance at which a scene repeats itself, a step from frame to frame, along it, up to which the part of the
 # video shows by how much the frames move; a larger one may be another by the whole distance
 _MOST_OF_REPETITION = 0.25
@@ -51,24 +48,17 @@ class FirstPass:
     """Follows corners from each usable frame of a video to the next one; copies of the frame before do not count."""
 
     def __init__(self, frames: VideoFrames, *, for_gyroscope: bool) -> None:
-        self._frames, self._timing, self._for_gyroscope = frames, frames.job.timing, for_gyroscope
-        self._times = frames.middles
+        self._frames, self._for_gyroscope, self._times = frames, for_gyroscope, frames.middles
         self.taken = frames.middles  # (N,) s, middle of every frame, and of copies that of the frame before
         self.faults: dict[int, str] = {}  # number of each frame that cannot be used, with the reason
         self.corners: dict[int, Corners] = {}  # between a frame and the next one, of the first frames of each part
         self.compared: dict[int, Array] = {}  # with a gyroscope, likewise, of some frames of the video
         self.repetitions: dict[int, Array | None] = {}  # without a gyroscope, of each part
         self._chosen = compared_pairs(len(frames.starts)) if for_gyroscope else []
-        self._others: set[int] = set()  # frames that show something else than the frame before
         self._before: tuple[int, Grey] | None = None  # the usable frame before, and its number
         self._changes: deque[float] = deque(maxlen=_MEMORY)  # counts, of the frames before
         self._waiting: list[tuple[int, Grey, float]] = []  # possible copies of it, and their changes
-        self._follower = CornerFollower(self._timing, compare_blur=not for_gyroscope and not frames.stabilised)
-
-    @property
-    def cuts(self) -> list[int]:
-        """Numbers of the first frames of further shots; two other frames in a row are a flash."""
-        return [index for index in sorted(self._others) if not self._others & {index - 1, index + 1}]
+        self._follower = CornerFollower(frames.job.timing, compare_blur=not for_gyroscope and not frames.stabilised)
 
     def pairs(self, progress: Callable[[], None]) -> Iterator[Corners | None]:
         """Corners between each usable frame and the one before; a thread follows them, up to a window ahead."""
@@ -110,9 +100,6 @@ class FirstPass:
         if before is None:
             return ()
         self._changes.append(changed)
-        if (corners is None or len(corners.rows) < _FEW) and _shows_other(grey, before[1]):
-            corners = None
-            self._others.add(index)
         if before[0] == index - 1:
             if corners is not None and index % PART_FRAMES < CHECKED_FRAMES:
                 self.corners[index - 1] = corners
@@ -122,15 +109,6 @@ class FirstPass:
             both = np.broadcast_to(self.taken[[before[0], index]], corners.times.shape)
             corners = replace(corners, times=both)
         return (corners,)
-
-
-def _shows_other(first: Grey, second: Grey) -> bool:
-    """Whether two frames (H, W) show different scenes, not one scene that moves by a part of the frame."""
-    small = [
-        cv2.resize(frame, _THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.float64) for frame in (first, second)
-    ]
-    contrast = min(float(frame.std()) for frame in small)
-    return float(np.abs(small[0] - small[1]).mean()) > _CUT * contrast
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +160,7 @@ class VideoMotion:
         widest = np.zeros(4)
         for index in range(len(self.frames.starts)):
             if index not in self.found.faults:
-                timing = self.frames.timing_of(0, index)
+                timing = self.frames.timing_of(index)
                 (x, y), _ = recorded_offsets(self.removed(index), timing, self.frames.size)
                 x, y = (x, y) if timing.scan_axis == -2 else (x.T, y.T)
                 sides = [-y[0].min(), y[-1].max(), -x[:, 0].min(), x[:, -1].max()]
@@ -215,7 +193,7 @@ class VideoMotion:
         """Corners between two frames where they are in the restored ones."""
         places: list[Array] = []
         for number, track in enumerate(pair):
-            exposure = self.frames.timing_of(0, track.index).exposure_time
+            exposure = self.frames.timing_of(track.index).exposure_time
             starts = corners.times[:, number] - self.found.taken[track.index] - 0.5 * exposure
             recorded = corners.places + (number - 0.5) * corners.offsets
             places.append(places_at_rest(track.motion, recorded, starts, exposure))
@@ -268,15 +246,15 @@ def video_motion(
     """
     found, timing, middles = FirstPass(frames, for_gyroscope=rates is not None), frames.job.timing, frames.middles
 
-    def to_steady(apart: Callable[[int, slice], Array], cuts: Sequence[int] = ()) -> Array:
-        return steady_shifts(middles, apart, options.steady, frames.size, options.crop_limit, cuts)
+    def to_steady(apart: Callable[[int, slice], Array]) -> Array:
+        return steady_shifts(middles, apart, options.steady, frames.size, options.crop_limit)
 
     if rates is None:
         with ONE_BLAS_THREAD:
             path = camera_path(found.pairs(progress), timing, frames.size, has_tones=not frames.stabilised)
         places = path.places(found.taken)
         _check_repetitions(found.repetitions, places[:, :2])
-        shift = to_steady(lambda number, others: places[others] - places[number], found.cuts)
+        shift = to_steady(lambda number, others: places[others] - places[number])
         polynomials = np.stack([path.derivatives(found.taken, 1), path.derivatives(found.taken, 2), shift], 1)
         polynomials[:, :2] *= not frames.stabilised
 
