@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, BinaryIO
 
-from rsvib_torch import tracking, video
+from rsvib_torch import io, tracking, video
 from rsvib_torch.checks.values import NotNegative, options
 from rsvib_torch.commands.answers import detection_data
 from rsvib_torch.commands.flat_command import Given, argument, option
@@ -25,7 +25,7 @@ class LiveOptions(CameraOptions):
     """Options of ``live``."""
 
     source: str = argument()
-    """Number or URL of a camera, or - for a video on standard input."""
+    """Number or URL of a camera, - for a video on standard input, or a file with frames."""
     out: Path | None = None
     """Video to write (.mp4, .mov, .m4v, .mkv), or - for raw frames to stdout."""
     tracker: Annotated[
@@ -46,17 +46,23 @@ def live_session(given: LiveOptions) -> Answer:
     The source is never blocked: if frames come faster than they are processed, the oldest waiting ones are dropped and
     counted. Ctrl-C ends the session. The video can be played at any moment, also after a crash or on a full disk.
     """
-    camera = int(given.source) if given.source.isdecimal() else given.source
-    if camera != "-" and "://" not in given.source and not given.source.isdecimal():
-        raise ValueError(f"{camera}: a camera is a number or a URL; rsvib run --video restores files")
-    settings = given.settings_for(None)
+    camera = given.source == "-" or given.source.isdecimal() or "://" in given.source
+    inputs = [] if camera else io.stack_files(given.source)
+    if inputs and not inputs[0].exists():
+        raise FileNotFoundError(f"{given.source}: no such file; a camera is a number or a URL")
+    settings = given.settings_for(None if camera else Path(given.source))
     written = [] if given.out is None or str(given.out) == "-" else [given.out]
     for path in written:
-        check_file(path, given.overwrite, [settings.path])
+        check_file(path, given.overwrite, [*inputs, settings.path])
     method: str = (settings.restoration | given.tracker).get("method", "dewarp")
     available = set(method_options(method)) - {"joint"}
     restoration = {name: value for name, value in settings.restoration.items() if name in available}
-    source = video.CameraSource("pipe:0" if camera == "-" else camera, settings.timing)
+    source: video.CameraSource | video.FileSource
+    if camera:
+        number = "pipe:0" if given.source == "-" else given.source
+        source = video.CameraSource(int(number) if number.isdecimal() else number, settings.timing, given.full_scale)
+    else:
+        source = video.FileSource(Path(given.source), settings.timing, given.full_scale or settings.full_scale)
     with _frames_on_standard_output(enabled=str(given.out) == "-") as stream:
         outputs: list[video.FrameOutput] = [
             video.VideoOutput(path, settings.timing.frame_rate, overwrite=given.overwrite) for path in written
@@ -66,7 +72,7 @@ def live_session(given: LiveOptions) -> Answer:
             settings.timing,
             **restoration | given.tracker | {"method": method},
             steady=given.steady,
-            full_scale=given.full_scale or 255.0,
+            full_scale=source.full_scale,
             channels="first",
         )
         report = video.run_live(source, tracker, outputs)
@@ -77,7 +83,7 @@ def live_session(given: LiveOptions) -> Answer:
     parts = [f"{number_of(count, 'frame')} {why}" for why, count in missing.items() if count]
     if parts:
         warn("; ".join(parts))
-    return _answer(given.source, report, written)
+    return _answer(given.source, report, written, waits=source.waits)
 
 
 @contextmanager
@@ -93,16 +99,20 @@ def _frames_on_standard_output(*, enabled: bool) -> Iterator[BinaryIO | None]:
         yield frames
 
 
-def _answer(source: str, report: video.LiveReport, files: list[Path]) -> Answer:
+def _answer(source: str, report: video.LiveReport, files: list[Path], *, waits: bool) -> Answer:
     rate = f"{report.seconds:.1f} s ({report.frames / report.seconds:.1f} per second)"
-    delays = {"delay_median": report.latency(0.5), "delay_99": report.latency(0.99)}
+    shares = {"delay_median": 0.5, "delay_99": 0.99}
+    delays = {name: None if waits else report.latency(share) for name, share in shares.items()}
     lines = [
         f"{number_of(report.frames, 'frame')} in {rate}, {report.tracked} with known motion, "
         f"{report.corrected} corrected",
         f"dropped {report.dropped}, not delivered {report.lost}, unusable {report.unusable}; vibration detected "
         f"{number_of(report.detections, 'time')}",
-        f"delay: {delays['delay_median']} frame periods in the median, {delays['delay_99']} in 99 % of the frames",
     ]
+    if not waits:
+        lines.append(
+            f"delay: {delays['delay_median']} frame periods in the median, {delays['delay_99']} in 99 % of the frames"
+        )
     if report.predicted:
         lines.append(f"{number_of(report.predicted, 'late frame')} predicted instead of measured")
     found = report.detection

@@ -1,6 +1,7 @@
 from .process_video import process_video
 from .session import (
     CameraSource,
+    FileSource,
     FrameOutput,
     FrameSource,
     LiveReport,
@@ -13,6 +14,7 @@ from .steadying import Margins
 
 __all__ = [
     "CameraSource",
+    "FileSource",
     "FrameOutput",
     "FrameSource",
     "LiveReport",

@@ -28,7 +28,9 @@ from rsvib_torch.detection import DetectionResult
 from rsvib_torch.execution.parallel import prefetched
 from rsvib_torch.files.atomic import sync
 from rsvib_torch.frames.full_scale import frames_to_counts
+from rsvib_torch.io.frame_times import timing_from_first_frame
 from rsvib_torch.io.stack_info import H264, StackInfo
+from rsvib_torch.io.stack_reading import open_stack, read_stack_info
 from rsvib_torch.io.video import CONTAINERS, VideoEncoder, check_video
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array
@@ -67,6 +69,7 @@ class FrameSource(Protocol):
     """A source of frames."""
 
     lost: int  # frames that the source did not deliver, by its clock
+    waits: bool  # whether it delivers a frame when there is room for it; frames of others are dropped
 
     def frames(self) -> Iterator[TimedFrame]:
         """The frames; called once, in the thread that reads. A generator releases the source in its ``finally``."""
@@ -110,8 +113,9 @@ class FrameCounter:
 class CameraSource:
     """A camera of OpenCV, by its number or URL; frames are RGB with 8 bits. ``pipe:0`` is a video on standard input."""
 
-    def __init__(self, camera: int | str, timing: SensorTiming) -> None:
-        self._camera, self._period, self.lost = camera, timing.frame_period, 0
+    def __init__(self, camera: int | str, timing: SensorTiming, full_scale: float | None = None) -> None:
+        self._camera, self._period, self.lost, self.waits = camera, timing.frame_period, 0, False
+        self.full_scale = full_scale or 255.0
 
     def frames(self) -> Iterator[TimedFrame]:
         """The frames; times are whole frame periods apart."""
@@ -136,8 +140,27 @@ class CameraSource:
             capture.release()
 
 
+class FileSource:
+    """A file, as ``open_stack`` reads it, with its frame times; ``full_scale`` is that of its counts."""
+
+    def __init__(self, path: Path, timing: SensorTiming, full_scale: float | None = None) -> None:
+        info = read_stack_info(path)
+        self._starts = timing_from_first_frame(timing, info).frame_starts(info.shape[0]).tolist()
+        self._path, self.lost, self.waits = path, 0, True
+        self.full_scale = (full_scale or info.full_scale) if info.is_integer else None
+
+    def frames(self) -> Iterator[TimedFrame]:
+        """The frames of the file."""
+        with closing(open_stack(self._path)) as reader:
+            for index, start in enumerate(self._starts):
+                yield TimedFrame(reader.frame(index), start - self._starts[0], time.perf_counter())
+
+
 class FrameReader:
-    """Frames of a source, read in a thread that never waits: if too many wait, the oldest are dropped and counted."""
+    """Frames of a source, read in a thread; up to a number of them wait.
+
+    If the source does not wait, the oldest waiting frames are dropped and counted.
+    """
 
     def __init__(self, source: FrameSource, waiting: int = 64) -> None:
         self._source, self._stopped, self.dropped = source, False, 0
@@ -152,15 +175,23 @@ class FrameReader:
     def _read(self) -> None:
         try:
             for frame in self._source.frames():
+                while not self._stopped and not self._put(frame):
+                    if not self._source.waits:
+                        with suppress(queue.Empty):  # it has just been taken
+                            self._frames.get_nowait()
+                            self.dropped += 1
                 if self._stopped:
                     return
-                if self._frames.full():
-                    with suppress(queue.Empty):  # it has just been taken
-                        self._frames.get_nowait()
-                        self.dropped += 1
-                self._frames.put_nowait(frame)  # no other thread puts frames
         except Exception as error:  # raised again in the thread that takes the frames
             self._error = error
+
+    def _put(self, frame: TimedFrame) -> bool:
+        """Whether there was room for a frame."""
+        try:
+            self._frames.put(frame, block=self._source.waits, timeout=_CHECK)
+        except queue.Full:
+            return False
+        return True
 
     def __iter__(self) -> Iterator[TimedFrame]:
         while not self._stopped:
@@ -311,9 +342,9 @@ def run_live(
 ) -> LiveReport:
     """Track the frames of a source, and write the restored ones, until the source ends or a signal arrives.
 
-    The source never waits. If processing is too slow, the motion of late frames is predicted instead of measured, and
-    beyond 64 waiting frames the oldest are dropped. SIGINT (Ctrl-C), SIGTERM and SIGHUP end the session in the main
-    thread, unless the caller handles or ignores them.
+    If processing is too slow for a source that does not wait, the motion of late frames is predicted instead of
+    measured, and beyond 64 waiting frames the oldest are dropped. SIGINT (Ctrl-C), SIGTERM and SIGHUP end the session
+    in the main thread, unless the caller handles or ignores them.
 
     Args:
         source: The source.
@@ -341,7 +372,8 @@ def run_live(
         ending.callback(reader.close)
         for output in outputs:
             ending.callback(output.close)
-        tracked_frames = prefetched(_tracked(reader, tracker, report), _WAITING_RESTORED, torch.get_num_threads())
+        of_source = _tracked(reader, tracker, report, waits=source.waits)
+        tracked_frames = prefetched(of_source, _WAITING_RESTORED, torch.get_num_threads())
         ending.enter_context(closing(tracked_frames))
         ending.callback(reader.stop)
         reader.start()
@@ -393,7 +425,7 @@ def _signals_stop(reader: FrameReader) -> Iterator[Callable[[], None]]:
 
 
 def _tracked(
-    reader: FrameReader, tracker: VibrationTracker, report: LiveReport
+    reader: FrameReader, tracker: VibrationTracker, report: LiveReport, *, waits: bool
 ) -> Generator[tuple[TrackedFrame, float], None, None]:
     """Tracked frames with the times of ``perf_counter`` at which they arrived.
 
@@ -401,7 +433,7 @@ def _tracked(
     delay of more than two frame periods in ten minutes (1024 x 1024, 30 frames/s).
     """
     for frame in reader:
-        is_late = time.perf_counter() - frame.arrived > 0.5 * tracker.timing.frame_period
+        is_late = not waits and time.perf_counter() - frame.arrived > 0.5 * tracker.timing.frame_period
         tracked = tracker.update(frame.pixels, frame.time, measure=not is_late)
         is_tracked = tracked.state == "tracking"
         report.tracked += is_tracked or bool(tracked.path.isfinite().all())

@@ -84,6 +84,7 @@ class Repeated:
     pixels: NDArray[np.uint8]
     count: int
     lost: int = 0
+    waits: bool = False
 
     def frames(self) -> Iterator[TimedFrame]:
         """The frames."""
