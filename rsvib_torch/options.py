@@ -31,7 +31,6 @@ OptionTable = Mapping[str, Any] | None
 Detections = Sequence[Any] | None  # entries are ``DetectedVibration`` or None
 Progress = Callable[[int, int], None] | None
 BorderName = Literal["mirror", "crop"]
-PixelFormat = Literal["gray8", "gray16le", "rgb24", "bgr24"]  # of raw frames in a pipe
 Channels = Literal["first", "last"] | None
 DetectionMethod = Literal["direct", "bands"]
 Mosaic = Literal["RGGB", "BGGR", "GRBG", "GBRG"]

@@ -60,7 +60,7 @@ def memory_of(value, seen=None, within_tracker=False):
 def tracked(*frames, **options):
     tracker = rsv.VibrationTracker(TIMING, **options)
     results = [tracker.update(frame) for frame in frames]
-    return tracker, results, [(one.restored, one.visible, one.detection, one.path) for one in results]
+    return tracker, results, [(one.restored, one.detection, one.path) for one in results]
 
 
 def offset_curve(pairs, rows, times, offsets):

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, BinaryIO
+from typing import Annotated, BinaryIO
 
 from rsvib_torch import io, tracking, video
 from rsvib_torch.checks.values import NotNegative, options
@@ -16,11 +16,8 @@ from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.shared_options import CameraOptions, check_file
 from rsvib_torch.commands.terminal import Answer, warn
 from rsvib_torch.files.reading import Table
-from rsvib_torch.options import PixelFormat, TrackerOptions, method_options
+from rsvib_torch.options import TrackerOptions, method_options
 from rsvib_torch.text import number_of
-
-if TYPE_CHECKING:
-    from rsvib_torch.config import Config
 
 
 @options
@@ -28,13 +25,9 @@ class LiveOptions(CameraOptions):
     """Options of ``live``."""
 
     source: str = argument()
-    """Number or URL of a camera, - for raw frames on standard input, or a file with frames."""
+    """Number or URL of a camera, - for a video on standard input, or a file with frames."""
     out: Path | None = None
     """Video to write (.mp4, .mov, .m4v, .mkv), or - for raw frames to stdout."""
-    size: str | None = option(None, metavar="WIDTHxHEIGHT")
-    """Size of the frames on standard input, e.g. 1024x768."""
-    pixel_format: PixelFormat = "gray8"
-    """Pixels of the frames on standard input."""
     tracker: Annotated[
         Table,
         Given(
@@ -53,15 +46,23 @@ def live_session(given: LiveOptions) -> Answer:
     The source is never blocked: if frames come faster than they are processed, the oldest waiting ones are dropped and
     counted. Ctrl-C ends the session. The video can be played at any moment, also after a crash or on a full disk.
     """
-    file = _file_of(given)
-    settings = given.settings_for(file)
+    camera = given.source == "-" or given.source.isdecimal() or "://" in given.source
+    inputs = [] if camera else io.stack_files(given.source)
+    if inputs and not inputs[0].exists():
+        raise FileNotFoundError(f"{given.source}: no such file; a camera is a number or a URL")
+    settings = given.settings_for(None if camera else Path(given.source))
     written = [] if given.out is None or str(given.out) == "-" else [given.out]
     for path in written:
-        check_file(path, given.overwrite, [*([] if file is None else io.stack_files(file)), settings.path])
+        check_file(path, given.overwrite, [*inputs, settings.path])
     method: str = (settings.restoration | given.tracker).get("method", "dewarp")
     available = set(method_options(method)) - {"joint"}
     restoration = {name: value for name, value in settings.restoration.items() if name in available}
-    source = _source(given, file, settings)
+    source: video.CameraSource | video.FileSource
+    if camera:
+        number = "pipe:0" if given.source == "-" else given.source
+        source = video.CameraSource(int(number) if number.isdecimal() else number, settings.timing, given.full_scale)
+    else:
+        source = video.FileSource(Path(given.source), settings.timing, given.full_scale or settings.full_scale)
     with _frames_on_standard_output(enabled=str(given.out) == "-") as stream:
         outputs: list[video.FrameOutput] = [
             video.VideoOutput(path, settings.timing.frame_rate, overwrite=given.overwrite) for path in written
@@ -71,15 +72,10 @@ def live_session(given: LiveOptions) -> Answer:
             settings.timing,
             **restoration | given.tracker | {"method": method},
             steady=given.steady,
-            full_scale=source.full_scale if given.full_scale is None or file else given.full_scale,
+            full_scale=source.full_scale,
             channels="first",
         )
-        report = video.run_live(
-            source,
-            tracker,
-            outputs,
-            drops=file is None,
-        )
+        report = video.run_live(source, tracker, outputs)
     if report.frames == 0:
         raise ValueError(f"{given.source}: no frame was read")
     slow = "dropped, because processing was too slow (fewer --columns)"
@@ -87,32 +83,7 @@ def live_session(given: LiveOptions) -> Answer:
     parts = [f"{number_of(count, 'frame')} {why}" for why, count in missing.items() if count]
     if parts:
         warn("; ".join(parts))
-    return _answer(given.source, report, written, drops=file is None)
-
-
-def _file_of(given: LiveOptions) -> Path | None:
-    """The file of the frames; None for the number or URL of a camera, and for standard input."""
-    if (given.source == "-") != (given.size is not None):
-        raise ValueError("--size WIDTHxHEIGHT is required for raw frames on standard input (-), and only for them")
-    if given.source == "-" or given.source.isdecimal() or "://" in given.source:
-        return None
-    if not io.stack_files(given.source)[0].exists():
-        raise FileNotFoundError(f"{given.source}: no such file; a camera is a number or a URL")
-    return Path(given.source)
-
-
-def _source(given: LiveOptions, file: Path | None, settings: Config) -> video.FrameSource:
-    if file is not None:
-        scale = given.full_scale if given.full_scale is not None else settings.full_scale
-        return video.FileSource(file, settings.timing, scale)
-    if given.size is None:
-        return video.CameraSource(int(given.source) if given.source.isdecimal() else given.source, settings.timing)
-    width, _, height = given.size.partition("x")
-    if not (width.isdecimal() and height.isdecimal() and 0 < int(width) < 10**6 and 0 < int(height) < 10**6):
-        raise ValueError(f"--size must be WIDTHxHEIGHT in px such as 1024x768, got {given.size!r}")
-    # not sys.stdin.buffer: Python aborts at the exit if a thread still waits in it
-    stream = os.fdopen(sys.stdin.fileno(), "rb", closefd=False)
-    return video.PipeSource(stream, (int(height), int(width)), given.pixel_format, settings.timing)
+    return _answer(given.source, report, written, waits=source.waits)
 
 
 @contextmanager
@@ -128,24 +99,25 @@ def _frames_on_standard_output(*, enabled: bool) -> Iterator[BinaryIO | None]:
         yield frames
 
 
-def _answer(source: str, report: video.LiveReport, files: list[Path], *, drops: bool) -> Answer:
+def _answer(source: str, report: video.LiveReport, files: list[Path], *, waits: bool) -> Answer:
     rate = f"{report.seconds:.1f} s ({report.frames / report.seconds:.1f} per second)"
+    shares = {"delay_median": 0.5, "delay_99": 0.99}
+    delays = {name: None if waits else report.latency(share) for name, share in shares.items()}
     lines = [
         f"{number_of(report.frames, 'frame')} in {rate}, {report.tracked} with known motion, "
         f"{report.corrected} corrected",
         f"dropped {report.dropped}, not delivered {report.lost}, unusable {report.unusable}; vibration detected "
         f"{number_of(report.detections, 'time')}",
     ]
+    if not waits:
+        lines.append(
+            f"delay: {delays['delay_median']} frame periods in the median, {delays['delay_99']} in 99 % of the frames"
+        )
     if report.predicted:
         lines.append(f"{number_of(report.predicted, 'late frame')} predicted instead of measured")
-    if drops:
-        delay = f"delay: {report.latency(0.5)} frame periods in the median"
-        lines.append(f"{delay}, {report.latency(0.99)} in 99 % of the frames")
     found = report.detection
     names = ("frames", "tracked", "corrected", "predicted", "unusable", "dropped", "lost", "detections", "seconds")
-    delays = {"delay_median": 0.5, "delay_99": 0.99}
-    data = {name: getattr(report, name) for name in names}
-    data |= {name: report.latency(part) if drops else None for name, part in delays.items()}
+    data = {name: getattr(report, name) for name in names} | delays
     data["detection"] = None if found is None else detection_data(found)
     results = {f"Live frames of {source}": lines}
     if found is not None:

@@ -9,7 +9,7 @@ import numpy as np
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.registration.corners import Corners, reduction
-from rsvib_torch.tracking.other_readouts import compared_readouts
+from rsvib_torch.tracking.window_checks import compared_readouts
 from rsvib_torch.tracking.window_fit import ROUNDS, WindowPath, averaging, fit_window, robust_weights
 from rsvib_torch.tracking.window_tones import Tone
 

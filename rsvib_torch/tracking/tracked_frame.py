@@ -15,12 +15,11 @@ from rsvib_torch.detection.sensitivity import timing_sensitivity, with_row_time_
 from rsvib_torch.detection.start import FieldScale
 from rsvib_torch.detection.tones.fit import ToneFit, displacement_std, residual_of, vibration_of_fit
 from rsvib_torch.detection.verdict import Findings
-from rsvib_torch.frames.prepare import PreparedFrames, frames_from_row_order
+from rsvib_torch.frames.prepare import PreparedFrames
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.numerics.tables import Array, table, tensor
 from rsvib_torch.options import TrackerOptions
-from rsvib_torch.restoration.frame_motion import visible_pixels
 from rsvib_torch.restoration.restore import restore_prepared, unchanged_frames
 
 TrackingState = Literal["searching", "tracking", "unusable"]
@@ -67,8 +66,7 @@ class TrackedFrame:
         frame: The frame as given.
         tones: The tones at this frame; None if they are not known.
         options: Options of the tracker.
-        lost: Why the motion that was followed until the frame before is not known any more, or that it cannot be found
-            because the times contradict the frame period; otherwise empty.
+        lost: That no motion can be found because the times contradict the frame period; otherwise empty.
     """
 
     time: float
@@ -82,34 +80,20 @@ class TrackedFrame:
     options: TrackerOptions
     lost: str = ""
 
-    def moved_to(self, place: Tensor) -> "TrackedFrame":
-        """The same frame with its content at another place (2,) of the path in px, to stabilise a video.
-
-        Content stays at ``path`` if the frame is not moved.
-        """
-        return replace(self, motion=replace(self.motion, image_shift=self.path - place))
-
     @cached_property
     def restored(self) -> Tensor:
         """The frame without the motion, in its shape; as taken if no motion is known. Computed at the first use.
 
         Another thread may use it while the next frame is tracked.
         """
-        if self._as_taken:
+        if not bool(self.motion.moving_axes().any()):
             return unchanged_frames(self.frame, joint=False)[0]
-        frame = self._timed_from_middle
+        # the time origin of the motion is the middle of the frame
+        half = self.frame.timing.time_to_middle(self.frame.images.shape[-2])
+        timing = replace(self.frame.image_timing, frame_start_times=(-half,))
+        frame = replace(self.frame, timing=timing.in_row_order(), image_timing=timing)
         with torch.no_grad():
             return frame.from_row_order(restore_prepared(frame, self.motion, self.options))[0]
-
-    @cached_property
-    def visible(self) -> Tensor:
-        """(H, W) bool, pixels of the restored frame that the sensor recorded; the others are extrapolated."""
-        everything = torch.ones_like(self.frame.images[0, 0, 0], dtype=torch.bool)
-        everything = frames_from_row_order(everything, self.frame.image_timing)
-        if self._as_taken:
-            return everything
-        height, width = everything.shape
-        return visible_pixels(self._timed_from_middle.image_timing, self.motion, (height, width), 1)[0][0]
 
     @cached_property
     def detection(self) -> DetectionResult | None:
@@ -141,14 +125,3 @@ class TrackedFrame:
             interval=float(measurements.interval.mean()),
         )
         return results[0]
-
-    @property
-    def _as_taken(self) -> bool:
-        return not bool(self.motion.moving_axes().any())
-
-    @property
-    def _timed_from_middle(self) -> PreparedFrames:
-        """The frame with the time origin of ``motion``."""
-        half = self.frame.timing.time_to_middle(self.frame.images.shape[-2])
-        timing = replace(self.frame.image_timing, frame_start_times=(-half,))
-        return replace(self.frame, timing=timing.in_row_order(), image_timing=timing)

@@ -154,11 +154,6 @@ class _State:
     untried: int = 0  # frames since the last attempt to detect the vibration
     attempts: int = 0  # to detect the vibration, since the rows last agreed with the tones
     contradictions: int = 0  # consecutive frames, and starts of the filter, whose rows contradict the tones
-    lost: str = ""  # why the motion is not known, of one that was followed or if times contradict the frame period
-
-    def without_track(self, reason: str) -> "_State":
-        """The state without the motion that was followed, if there was one."""
-        return replace(self, track=None, lost="" if self.track is None else reason)
 
 
 class VibrationTracker:
@@ -240,7 +235,7 @@ class VibrationTracker:
                 f"frame has {rows} rows of {columns} px, the frames before had {rows_before} of {columns_before}; "
                 "call reset() before another size"
             )
-        state = replace(self._state, time=time, lost="")
+        state = replace(self._state, time=time)
         if latest.shows_nothing_new(before):
             return self._result(prepared, state, usable=False)
         longest = MAX_SPAN * self._rows.row_time  # s; frames further apart do not resolve frequencies
@@ -253,11 +248,8 @@ class VibrationTracker:
             predicted = None if measure else self._predicted(state)
             try:
                 state = self._detected(self._measured(state)) if predicted is None else predicted
-            except (ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
-                state = state.without_track(str(error).partition("\n")[0])  # no argument is wrong: they were checked
-        if not state.lost and (state.track is None or state.contradictions >= _PATIENCE):
-            starts = tensor(np.array([*(frame.time for frame in self._state.frames), time]))
-            state = replace(state, lost=contradiction(self._rows, starts, 0))
+            except (ValueError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
+                state = replace(state, track=None)  # no argument is wrong: they were checked
         return self._result(prepared, state)
 
     def _checked_time(self, time: float | None) -> float:
@@ -284,7 +276,7 @@ class VibrationTracker:
         fit, step = prediction.as_fit(centre), centre - track.filter.time
         is_accurate = prediction.displacement_std() < _MAX_PREDICTED_STD  # not if it is not a number
         if not (is_accurate and self._is_possible(track, frame, fit)):
-            return state.without_track("the motion cannot be predicted")
+            return replace(state, track=None)
         path = state.path + track.filter.path(step)
 
         # 2. The gradients of the scene are used again unless they are old or the scene has moved.
@@ -309,7 +301,7 @@ class VibrationTracker:
             around = motion.mean_displacement(tensor(measurements.exposure_starts), self._rows.exposure_time)
             largest = float(np.abs(by_tones + by_drift - measurements.relative(table(around))).max())
             if not math.isfinite(largest):  # the rows were not measured
-                return state.without_track("the rows cannot be measured")
+                return replace(state, track=None)
             if largest < _MAX_CHANGE:
                 break
             fit, path, scene = corrected.as_fit(centre), state.path - corrected.path(-step), None
@@ -332,7 +324,7 @@ class VibrationTracker:
         at_middle = corrected.predicted(frame.time + self._rows.time_to_middle(height), mixed=False)
         fit, growth = at_middle.as_fit(frame.time), at_middle.growth()
         if not (other.unexplained.max() < _MAX_UNEXPLAINED and self._is_possible(track, frame, fit)):
-            return state.without_track("the rows are far from where the motion places them")
+            return replace(state, track=None)
         # 2. The verdict on the tones.
         aliasing, interval = table(scene.gradients.aliasing), np.array([frame.time - track.start])
         fit = with_unknown_amplitudes(fit, aliasing, other.unexplained, interval, self._rows.exposure_time, known=0)
@@ -472,7 +464,7 @@ class VibrationTracker:
             drift = torch.stack([speed, torch.zeros_like(speed)], -1)
         drift = drift + torch.stack([(tones * rate).real, (tones * rate.square()).real], -1).mul(slow[..., None]).sum(1)
         if not bool(torch.isfinite(drift).all()):  # no row of the last frame was measured
-            return state.without_track("the rows cannot be measured")
+            return replace(state, track=None)
         # 2. Tones, with twice the standard deviations, because the last frame is measured again. Those of a record
         # allow for further tones, which the filter does not.
         size_std = torch.minimum(std.amplitude, 0.05 * vibration.amplitude)
@@ -488,7 +480,7 @@ class VibrationTracker:
     def _result(self, prepared: PreparedFrames, state: _State, *, usable: bool = True) -> TrackedFrame:
         """The result for the last frame, moved to where the steady image is; the state is kept."""
         label: TrackingState = "searching" if usable else "unusable"
-        device, measurements = prepared.images.device, None
+        device, measurements, lost = prepared.images.device, None, ""
         motion, live = Vibration.still(device=device), state.live
         track = state.track if usable else None
         tones = None if track is None else track.tones
@@ -501,6 +493,9 @@ class VibrationTracker:
             # An axis moves if its tones were reliable in one of the last frames.
             motion = motion.scaled(tensor(np.any(track.trusted, 0)).to(device)).from_row_order(self.timing)
             label = "searching" if state.contradictions >= _PATIENCE else "tracking"
+        if label == "searching":
+            starts = tensor(np.array([*(frame.time for frame in self._state.frames), state.time]))
+            lost = contradiction(self._rows, starts, 0)
         if usable and self.options.steady:  # rows follow the path of the corners along both axes
             live = live.followed(state.frames[-1].grey(self.timing), state.time, motion)
             live = live.steadied(state.time - self._state.time, self.options.steady)
@@ -518,7 +513,7 @@ class VibrationTracker:
             frame=prepared,
             tones=tones,
             options=self.options,
-            lost=state.lost,
+            lost=lost,
         )
 
 

@@ -1,7 +1,15 @@
-from .frame_outputs import FrameOutput, PipeOutput, VideoOutput
 from .process_video import process_video
-from .session import LiveReport, run_live
-from .sources import CameraSource, FileSource, FrameSource, PipeSource, TimedFrame
+from .session import (
+    CameraSource,
+    FileSource,
+    FrameOutput,
+    FrameSource,
+    LiveReport,
+    PipeOutput,
+    TimedFrame,
+    VideoOutput,
+    run_live,
+)
 from .steadying import Margins
 
 __all__ = [
@@ -12,7 +20,6 @@ __all__ = [
     "LiveReport",
     "Margins",
     "PipeOutput",
-    "PipeSource",
     "TimedFrame",
     "VideoOutput",
     "process_video",

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import count, groupby
 from pathlib import Path
 
@@ -31,17 +31,13 @@ from rsvib_torch.stacks.manifest import fingerprint, manifest_header, rms_shakin
 from rsvib_torch.stacks.memory import share_one_heap
 from rsvib_torch.stacks.run_folder import FileRun, RunFolder, StackReport
 from rsvib_torch.video import Margins
-from rsvib_torch.video.first_pass import PART_FRAMES
 from rsvib_torch.video.video_frames import Frame, FrameTrack, VideoFrames
-from rsvib_torch.video.video_passes import VideoMotion, VideoPart, shakes_more, video_motion
+from rsvib_torch.video.video_motion import PART_FRAMES, VideoMotion, VideoPart, shakes_more, video_motion
 
 _TOGETHER = ("joint", "scale", "mosaic", "optics")  # options of restore that frames one by one do not have
 
 # What the manifest states of the alignment of a gyroscope.
 _OF_GYROSCOPE = ("orientation", "offset", "offset_std", "scale", "bias", "focal_length", "focal_length_std")
-
-Planes = list[Frame]
-_Restored = tuple[FrameTrack, Planes | None]  # what was removed from a frame, and its planes; None: it cannot be read
 
 
 @file_options(ProcessVideoOptions)
@@ -50,23 +46,19 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
 
     The video is read twice. The first pass follows corners from frame to frame and fits, in overlapping windows of 96
     frames, the path of the camera (x, y, roll, zoom) and the tones of its vibration, each corner at the time of its
-    row: hands, pans, parallax and moving objects do not disturb them. The second pass restores the frames: tones, and
-    with ``steady`` also the skew and wobble by the path, are undone, and the frames are moved to a smooth path. With
-    ``gyroscope``, corners of 48 pairs of frames align its rates as in ``align_motion``; the path is the rotation of the
-    camera at the time of every row, with the vibration that the gyroscope resolves, and no tones are fitted. Frames
-    of 4:2:0 videos are restored as they are stored: luma with the method, chroma, which has half the resolution, with
-    ``"dewarp"``; H.264 gets 8 of 10 bits. Decoding, restoration and encoding run in threads.
-
-    If the track of a GoPro video states the exposure of every frame (``SHUT``), it replaces that of ``timing``. If it
-    states that the camera has stabilised the images (``IORI``), they are moved as a whole, without tones and wobble.
-
-    Tones that sweep are followed in windows of 24 frames, where others leave more than 0.3 px.
+    row: hands, pans, parallax and moving objects do not disturb them. Tones that sweep are followed in windows of 24
+    frames, where others leave more than 0.3 px. The second pass restores the frames: tones, and with ``steady`` also
+    the skew and wobble by the path, are undone, and the frames are moved to a smooth path. With ``gyroscope``, corners
+    of 48 pairs of frames align its rates as in ``align_motion``, and the path is the rotation of the camera with the
+    vibration that the gyroscope resolves; no tones are fitted. Of 4:2:0 videos, luma is restored with the method, and
+    chroma with ``"dewarp"``; H.264 gets 8 of 10 bits. The track of a GoPro video replaces the exposure of ``timing``
+    (``SHUT``); if it states that the camera has stabilised the images (``IORI``), they are moved as a whole.
 
     Of a part of 32 frames whose first eight would shake more than as taken, rows are not moved apart: no vibration, and
     with ``steady`` no wobble, is undone. Frames that cannot be decoded and constant frames are replaced by the frame
     before (at the beginning of a part by the one behind them); copies of the frame before are moved along the smooth
-    path. The video is encoded in parts in the folder ``.NAME.rsvib`` beside it, from which an interrupted run is
-    resumed. A video whose corners shake more in the restored frames than in those of the input is not written.
+    path. Parts are encoded in the folder ``.NAME.rsvib``, from which an interrupted run is resumed. A video whose
+    corners shake more in the restored frames than in those of the input is not written.
 
     Args:
         source: A video, or another stack as in ``read_stack``.
@@ -217,55 +209,54 @@ class _SecondPass:
     info: StackInfo  # of the video to write
     margins: Margins | None  # which are cut off
     progress: Callable[[], None]
-    parts: dict[int, VideoPart] = field(default_factory=dict)  # that are not yet in the folder
 
     def run(self, at_once: int) -> None:
         """Restore a number of frames at the same time."""
         share_one_heap()
         threads = 1 if self.motion.frames.job.options.device == "cpu" else torch.get_num_threads()
         with closing(in_threads(self._restored, self._missing(), at_once=at_once, threads=threads)) as frames:
-            for part, of_part in groupby(frames, lambda one: one[0].index // PART_FRAMES):
-                self._encode(self.parts.pop(part), of_part)
+            for part, of_part in groupby(frames, lambda one: one[0]):
+                self._encode(part, (restored for _, restored in of_part))
 
-    def _missing(self) -> Generator[tuple[FrameTrack, Frame | str], None, None]:
-        """The frames to restore, with what is removed from them."""
-        motion = self.motion
-        with closing(motion.frames.decoded()) as decoded:
-            for part, frames in groupby(enumerate(decoded), lambda one: one[0] // PART_FRAMES):
-                if part in self.folder:
+    def _missing(self) -> Generator[tuple[VideoPart, FrameTrack, Frame | str], None, None]:
+        """The frames to restore, with their part and what is removed from them."""
+        with closing(self.motion.frames.decoded()) as decoded:
+            for number, frames in groupby(enumerate(decoded), lambda one: one[0] // PART_FRAMES):
+                if number in self.folder:
                     for _ in frames:
                         self.progress()
                     continue
-                self.parts[part] = motion.part(part)
-                for track, (_, frame) in zip(self.parts[part].tracks, frames, strict=True):
-                    yield track, frame
+                part = self.motion.part(number)
+                for track, (_, frame) in zip(part.tracks, frames, strict=True):
+                    yield part, track, frame
 
-    def _restored(self, track: FrameTrack, frame: Frame | str) -> _Restored:
-        return track, None if isinstance(frame, str) else self.motion.frames.restored(frame, track)
+    def _restored(self, part: VideoPart, track: FrameTrack, frame: Frame | str) -> tuple[VideoPart, Frame | None]:
+        """A restored frame; None if it could not be used."""
+        if isinstance(frame, str) or track.fault is not None:
+            return part, None
+        layout = self.motion.frames
+        return part, layout.frame(_cut(layout.restored(frame, track), self.margins))
 
-    def _encode(self, part: VideoPart, frames: Iterator[_Restored]) -> None:
+    def _encode(self, part: VideoPart, frames: Iterator[Frame | None]) -> None:
         """Encode the frames of a part, and enter it in the folder."""
         layout, folder = self.motion.frames, self.folder
-        name = f"{part.number:06d}{folder.sink.suffix.lower()}"
+        name, waiting = f"{part.number:06d}{folder.sink.suffix.lower()}", 0
         shown: Frame | None = None  # the last frame that could be used
         with part_of_video(folder.create(name), folder.sink, self.info, layout.picture) as write:
-            for number, (track, planes) in enumerate(frames):
+            for number, frame in enumerate(frames):
                 if number:
                     self.progress()  # the frame before is complete
-                if planes is not None and track.fault is None:
-                    is_first, shown = shown is None, layout.frame(_cut(planes, self.margins))
-                    for _ in range(number if is_first else 0):  # those before it could not be used
-                        write(shown)
-                if shown is not None:
+                shown, waiting = shown if frame is None else frame, waiting + 1
+                while waiting and shown is not None:  # the first frame that can be used also replaces those before it
                     write(shown)
-            if shown is None:
-                for _ in part.tracks:
-                    write(layout.frame(_cut(layout.black(), self.margins)))
+                    waiting -= 1
+            for _ in range(waiting):
+                write(layout.frame(_cut(layout.black(), self.margins)))
         folder.add(self.motion.record(part), name)
         self.progress()
 
 
-def _cut(planes: Planes, margins: Margins | None) -> Planes:
+def _cut(planes: list[Frame], margins: Margins | None) -> list[Frame]:
     """Planes without margins; those of chroma are half as wide."""
     if margins is None:
         return planes

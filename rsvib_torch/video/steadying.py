@@ -1,7 +1,7 @@
 """Steady videos: a smooth path near the path of the camera, and the margins that the frames lose."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -50,7 +50,6 @@ def steady_shifts(
     duration: float,
     size: tuple[int, int],
     limit: float,
-    cuts: Sequence[int] = (),
 ) -> Array:
     """(N, 4), places of a camera less those of a smooth path along its path, which keeps slow motion.
 
@@ -64,7 +63,6 @@ def steady_shifts(
         duration: s; 0: the path itself.
         size: (height, width) of the frames in px.
         limit: Largest displacement of a corner of the frame, in parts of its width (x) and height (y).
-        cuts: Numbers of the first frames of further shots, increasing; every shot has its own smooth path.
 
     Example:
         >>> times = np.arange(90) / 30.0
@@ -77,7 +75,7 @@ def steady_shifts(
     if duration == 0 or len(times) < 3:
         return np.zeros((len(times), 4))
     # 1. The path with shorter and shorter windows; the last level is the path itself.
-    levels = [-_local_lines(times, apart, duration / 2**level, cuts) for level in range(_HALVINGS + 1)]
+    levels = [-_local_lines(times, apart, duration / 2**level) for level in range(_HALVINGS + 1)]
     levels.append(np.zeros_like(levels[0]))
     far = [largest_displacement(level, size) for level in levels]
     # 2. The longest window of every frame that keeps the limit; it changes slowly along the video.
@@ -90,13 +88,10 @@ def steady_shifts(
     return (1 - share) * stacked[first, every] + share * stacked[first + 1, every]
 
 
-def _local_lines(times: Array, apart: Callable[[int, slice], Array], duration: float, cuts: Sequence[int]) -> Array:
-    """Values of straight lines that fit the path of a shot around every place, with the weights of a Hann window."""
+def _local_lines(times: Array, apart: Callable[[int, slice], Array], duration: float) -> Array:
+    """Values of straight lines that fit the path around every place, with the weights of a Hann window."""
     lines = np.empty((len(times), 4))
-    borders = np.array([0, *cuts, len(times)])
-    shots = np.searchsorted(borders, np.arange(len(times)), "right")
-    firsts = np.maximum(np.searchsorted(times, times - duration), borders[shots - 1])
-    ends = np.minimum(np.searchsorted(times, times + duration, "right"), borders[shots])
+    firsts, ends = np.searchsorted(times, times - duration), np.searchsorted(times, times + duration, "right")
     for number, (first, end) in enumerate(zip(firsts, ends, strict=True)):
         places, delay = apart(number, slice(first, end)), times[first:end] - times[number]
         weight = np.cos(0.5 * math.pi * delay / duration) ** 2 + 1e-9

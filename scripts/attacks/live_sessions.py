@@ -242,21 +242,21 @@ def _before_the_first_frame(name: str, out: Path, frames: int) -> Trial:
 
 
 def _pipe(name: str, out: Path, frames: int, *, reader_ends: bool) -> Trial:
-    """Raw frames from an open pipe to a reader, which ends, or which reads no more while SIGTERM arrives."""
-    command = rsvib("live", "-", *_CAMERA, "--size", f"{_SIZE}x{_SIZE}", "--out", "-")
-    printed, frame = out.with_name("pipe.txt"), bytes(range(256)) * (_SIZE * _SIZE // 256)
+    """Frames from an open pipe to a reader, which ends, or which reads no more while SIGTERM arrives."""
+    command = rsvib("live", "-", *_CAMERA, "--out", "-")
+    printed, frame = out.with_name("pipe.txt"), b"FRAME\n" + bytes(range(256)) * (_SIZE * _SIZE // 256)
     with printed.open("wb") as errors:
         child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors)
     assert child.stdin is not None
     assert child.stdout is not None
     session = _Session(child, out, printed)
-    child.stdin.write(frame * frames)
+    child.stdin.write(f"YUV4MPEG2 W{_SIZE} H{_SIZE} F{_RATE}:1 Cmono\n".encode() + frame * frames)
     child.stdin.flush()
-    child.stdout.read(_SIZE * _SIZE)
+    child.stdout.read(3 * _SIZE * _SIZE)
     if reader_ends:
         child.stdout.close()
     else:
-        time.sleep(1.0)  # the pipe is full: it holds four frames
+        time.sleep(1.0)  # the pipe is full: it holds one frame
         session.send(signal.SIGTERM)
     process = session.ended()
     child.stdin.close()

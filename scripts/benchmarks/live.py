@@ -8,7 +8,7 @@ import argparse
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 
 import rsvib_torch as rsv
 from rsvib_torch.datasets import city_and_fields
-from rsvib_torch.video import LiveReport, TimedFrame, run_live
+from rsvib_torch.video import TimedFrame, run_live
+from rsvib_torch.video.session import to_counts
 
 OPTIONS = {
     "minutes": (0.5, "live: duration of the session"),
@@ -78,34 +79,31 @@ def frames_of(size: int, motion: Changing, count: int) -> NDArray[np.uint8]:
 
 @dataclass
 class Repeated:
-    """A source that repeats frames, at the rate of the camera or as fast as they are taken."""
+    """A source that repeats frames at the rate of the camera."""
 
     pixels: NDArray[np.uint8]
     count: int
-    paced: bool
-    full_scale: float | None = 255.0
     lost: int = 0
+    waits: bool = False
 
     def frames(self) -> Iterator[TimedFrame]:
         """The frames."""
         begin = time.perf_counter()
         for index in range(self.count):
-            if self.paced and (wait := begin + index / RATE - time.perf_counter()) > 0:
-                time.sleep(wait)
+            time.sleep(max(0.0, begin + index / RATE - time.perf_counter()))
             yield TimedFrame(self.pixels[index % len(self.pixels)], index / RATE, time.perf_counter())
 
 
-@dataclass
 class Output:
-    """An output that keeps the frames or not."""
+    """An output that measures the memory of the process once a second."""
 
-    keeps: bool = False
-    frames: list[NDArray[np.uint8]] = field(default_factory=list)
+    def __init__(self) -> None:
+        self.process, self.memory = psutil.Process(), list[int]()
 
     def write(self, frame: NDArray[np.uint8], index: int) -> None:
         """Take a frame."""
-        if self.keeps:
-            self.frames.append(frame)
+        if index % RATE == 0:
+            self.memory.append(self.process.memory_info().rss)
 
     def close(self) -> None:
         """Nothing is open."""
@@ -119,17 +117,10 @@ def errors(found: rsv.DetectionResult, amplitude: NDArray[Any], frequency: NDArr
 
 def session(pixels: NDArray[np.uint8], size: int, minutes: float) -> dict[str, Any]:
     """A paced session."""
-    process, count = psutil.Process(), round(60 * RATE * minutes)
-    memory: list[float] = []
-
-    def watch(tracked: rsv.TrackedFrame, _: LiveReport) -> None:
-        if round(tracked.time * RATE) % RATE == 0:
-            memory.append(process.memory_info().rss)
-
-    tracker = rsv.VibrationTracker(timing_of(size))
-    begin = process.cpu_times()
-    report = run_live(Repeated(pixels, count, paced=True), tracker, [Output()], max_frames=count, progress=watch)
-    cpu = process.cpu_times()
+    count, output, tracker = round(60 * RATE * minutes), Output(), rsv.VibrationTracker(timing_of(size))
+    begin = output.process.cpu_times()
+    report = run_live(Repeated(pixels, count), tracker, [output])
+    cpu, memory = output.process.cpu_times(), output.memory
     half = len(memory) // 2
     return {
         "name": "session",
@@ -208,9 +199,8 @@ def phase_correlated(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 def tracked_frames(pixels: NDArray[np.uint8], size: int, method: str) -> NDArray[np.uint8]:
     """Frames that are tracked and restored as fast as possible."""
-    output, tracker = Output(keeps=True), rsv.VibrationTracker(timing_of(size), method=method)
-    run_live(Repeated(pixels, len(pixels), paced=False), tracker, [output], drops=False)
-    return np.stack(output.frames)
+    tracker = rsv.VibrationTracker(timing_of(size), method=method)
+    return np.stack([to_counts(tracker.update(frame).restored) for frame in pixels])
 
 
 def rows(options: argparse.Namespace) -> Rows:

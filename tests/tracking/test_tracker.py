@@ -280,17 +280,6 @@ def test_a_copy_of_a_tracker_does_not_affect_the_tracker(steady):
         assert torch.equal(ours.detection.vibration.phase, theirs.detection.vibration.phase)
 
 
-def test_content_is_moved_by_a_constant_displacement(steady):
-    one = track(steady[0][:13], steady=1e-6)[12]
-    place = one.path + torch.tensor([3.0, -2.0])
-    moved = one.moved_to(torch.zeros(2, dtype=torch.float64)).moved_to(place)
-    torch.testing.assert_close(moved.motion.image_shift, one.path - place)
-    assert torch.equal(moved.motion.amplitude, one.motion.amplitude)
-    shift = moved.restored[24:-24, 24:-24] - torch.roll(one.restored, (-2, 3), (0, 1))[24:-24, 24:-24]
-    assert float(shift.abs().mean()) < 0.03  # by whole pixels
-    assert int((~moved.visible).sum()) > int((~one.visible).sum())
-
-
 def test_frames_without_a_common_scene_or_with_few_rows_are_searched_in_vain(steady):
     frames, _ = steady
     scene = torch.as_tensor(draw_scene(SIZE, SIZE + 900, seed=9), dtype=torch.float32)
@@ -345,7 +334,7 @@ def test_times_in_another_unit_are_why_no_motion_is_found(steady, unit):
     for tracked in track(frames[:6], [unit * number / RATE for number in range(6)])[1:]:
         if tracked.state == "searching":
             message = f"by their times, frames are {unit / RATE:.3g} s apart, but the frame period is 0.0333 s"
-            assert tracked.lost.startswith(message) or "motion" in tracked.lost
+            assert tracked.lost.startswith(message)
     for tracked in track(frames[:3], [0.0, 1 / RATE, 9 / RATE]):  # frames are missing
         assert tracked.lost == ""
 
@@ -361,10 +350,10 @@ def test_large_motions_with_gaps_end_in_a_search_and_not_in_an_error(steady):
         frame = torch.roll(frames[index], (shift, -shift), (0, 1))
         time += 1 / RATE if index < 6 or generator.random() > share else generator.uniform(0.03, longest)
         tracked = tracker.update(frame, time, measure=bool(generator.random() < 0.8))
-        lost.append(tracked.lost)
+        lost.append(tracked.state)
         assert torch.isfinite(tracked.restored).all()
         assert tracked.detection is None or tracked.detection.vibration.amplitude.max() < SIZE
-    assert {""} < set(lost)
+    assert {"searching", "tracking"} == set(lost[6:])
     assert torch.isfinite(tracker.update(frames[20], time + 1e9).restored).all()
 
 
@@ -456,4 +445,3 @@ def test_a_steady_image_does_not_jump_where_its_path_is_lost(steady):
     assert shifts[16] == pytest.approx(shifts[15])  # a frame that shows nothing
     assert shifts[18:] == pytest.approx(shifts[17:19] * np.exp(-1 / RATE / 0.5), abs=1e-9)
     assert not torch.equal(tracked[18].restored, others[2])
-    assert not tracked[18].visible.all()

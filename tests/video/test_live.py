@@ -1,6 +1,5 @@
 """Sources and outputs of live sessions."""
 
-import io
 import os
 import resource
 import signal
@@ -15,21 +14,9 @@ from truth import draw_scene
 
 import rsvib_torch as rsv
 from rsvib_torch import video
-from rsvib_torch.video.sources import FrameCounter, FrameReader
+from rsvib_torch.video.session import FrameCounter, FrameReader
 
 TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=1 / 30 / 1e-4)
-
-
-def test_raw_frames_of_a_pipe():
-    colours = np.arange(2 * 3 * 4 * 3, dtype=np.uint8).reshape(2, 3, 4, 3)
-    data = colours[..., ::-1].tobytes() + b"end"
-    source = video.PipeSource(io.BytesIO(data), (3, 4), "bgr24", TIMING)
-    frames = list(source.frames())
-    assert [np.array_equal(one.pixels, np.moveaxis(truth, -1, 0)) for one, truth in zip(frames, colours, strict=True)]
-    assert [one.time for one in frames] == pytest.approx([0.0, 1 / 30])
-    deep = video.PipeSource(io.BytesIO(b"\x01\x02" * 6), (2, 3), "gray16le", TIMING)
-    assert next(deep.frames()).pixels.tolist() == [[513] * 3] * 2
-    assert deep.full_scale == 65535
 
 
 @dataclass
@@ -37,7 +24,7 @@ class Numbers:
     """Frames of one pixel, as fast as possible."""
 
     count: int = 50
-    full_scale: float | None = None
+    waits: bool = False
     lost: int = 0
     closed: bool = False
     error: Exception | None = None
@@ -56,9 +43,9 @@ def values(reader):
     return [int(frame.pixels[0, 0]) for frame in reader]
 
 
-@pytest.mark.parametrize(("drops", "lost"), [(True, 42), (False, 0)])
-def test_the_oldest_waiting_frames_are_dropped_and_counted_unless_the_source_may_wait(drops, lost):
-    reader = FrameReader(source := Numbers(), waiting=8, drops=drops)
+@pytest.mark.parametrize(("waits", "lost"), [(False, 42), (True, 0)])
+def test_the_oldest_waiting_frames_are_dropped_and_counted_unless_the_source_waits(waits, lost):
+    reader = FrameReader(source := Numbers(waits=waits), waiting=8)
     reader.start()
     time.sleep(0.2)
     assert values(reader) == list(range(lost, 50))
@@ -67,16 +54,16 @@ def test_the_oldest_waiting_frames_are_dropped_and_counted_unless_the_source_may
     assert source.closed
 
 
-@pytest.mark.parametrize("drops", [True, False])
-def test_a_reader_that_is_stopped_releases_the_source_with_the_next_frame(drops):
-    reader = FrameReader(source := Numbers(10**9), waiting=10**6, drops=drops)
+@pytest.mark.parametrize("waits", [False, True])
+def test_a_reader_that_is_stopped_releases_the_source_with_the_next_frame(waits):
+    reader = FrameReader(source := Numbers(10**9, waits=waits))
     reader.start()
     reader.close()
     assert source.closed
 
 
 def test_an_error_of_the_source_arrives_behind_its_frames():
-    reader = FrameReader(Numbers(3, error=OSError("unplugged")), drops=False)
+    reader = FrameReader(Numbers(3, error=OSError("unplugged")))
     reader.start()
     refuses(lambda: values(reader), "unplugged", OSError)
 
@@ -176,12 +163,18 @@ def test_signals_end_a_session(tmp_path, number):
     usual = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
     output, before = video.VideoOutput(tmp_path / "video.mkv", 30.0), signal.signal(number, usual)  # nohup ignores some
 
-    def end(tracked, report):
-        if round(tracked.time * 30) == 5:
-            signal.raise_signal(number)
-            signal.raise_signal(number)  # a second one does not end the process
+    class Ending:
+        """An output that gets two signals; the second one does not end the process."""
 
-    report = video.run_live(Numbers(), rsv.VibrationTracker(TIMING), [output], drops=False, progress=end)
+        def write(self, frame, index):
+            if index == 5:
+                signal.raise_signal(number)
+                signal.raise_signal(number)
+
+        def close(self):
+            pass
+
+    report = video.run_live(Numbers(), rsv.VibrationTracker(TIMING), [output, Ending()])
     assert report.frames == len(rsv.read_stack(tmp_path / "video.mkv"))
     assert 6 <= report.frames <= 8  # at most two frames are tracked ahead of the written one
     assert signal.signal(number, before) == usual
@@ -191,14 +184,14 @@ def test_the_end_of_a_reader_ends_a_session():
     reader, writer = os.pipe()
     os.close(reader)
     with os.fdopen(writer, "wb", buffering=0) as stream:
-        report = video.run_live(Numbers(), rsv.VibrationTracker(TIMING), [video.PipeOutput(stream)], drops=False)
+        report = video.run_live(Numbers(), rsv.VibrationTracker(TIMING), [video.PipeOutput(stream)])
     assert report.frames == 0
 
 
 def test_frames_before_an_error_of_the_source_are_not_lost(tmp_path):
     source = Numbers(3, error=OSError("unplugged"))
     output = video.VideoOutput(tmp_path / "video.mkv", 30.0)
-    refuses(lambda: video.run_live(source, rsv.VibrationTracker(TIMING), [output], drops=False), "unplugged", OSError)
+    refuses(lambda: video.run_live(source, rsv.VibrationTracker(TIMING), [output]), "unplugged", OSError)
     assert rsv.read_stack_info(tmp_path / "video.mkv").shape == (3, 1, 1)
     assert source.closed
 
@@ -206,10 +199,10 @@ def test_frames_before_an_error_of_the_source_are_not_lost(tmp_path):
 class Shaking:
     """Frames of a vibrating camera at its rate."""
 
-    full_scale, lost = None, 0
+    lost = 0
 
-    def __init__(self, pixels):
-        self.pixels = pixels
+    def __init__(self, pixels, waits=False):
+        self.pixels, self.waits = pixels, waits
 
     def frames(self):
         begin = time.perf_counter()
@@ -228,19 +221,19 @@ class SlowTracker(rsv.VibrationTracker):
         return tracked
 
 
-@pytest.mark.parametrize("drops", [True, False])
-def test_the_motion_of_late_frames_is_predicted(drops):
+@pytest.mark.parametrize("waits", [False, True])
+def test_the_motion_of_late_frames_is_predicted_unless_the_source_waits(waits):
     vibration = rsv.Vibration([2.1, 1.6], [0.37 / TIMING.frame_period] * 2, [0.5, 1.0])
     frames = rsv.simulate_frames(draw_scene(200, 200, seed=3), TIMING, vibration, 40, frame_size=(160, 160)).numpy()
-    report = video.run_live(Shaking(frames), SlowTracker(TIMING, columns=None), [], drops=drops)
+    report = video.run_live(Shaking(frames, waits), SlowTracker(TIMING, columns=None), [])
     assert (report.frames, report.dropped) == (40, 0)
-    assert (report.predicted > 5) == drops
+    assert (report.predicted > 5) != waits
 
 
 def test_frames_of_a_camera_at_rest_are_tracked_but_not_corrected():
     noise = np.random.default_rng(0).normal(0.0, 0.005, (6, 160, 160))
     frames = (draw_scene(160, 160, seed=3) + noise).astype(np.float32)
-    report = video.run_live(Shaking(frames), rsv.VibrationTracker(TIMING), [], drops=False)
+    report = video.run_live(Shaking(frames), rsv.VibrationTracker(TIMING), [])
     assert report.tracked >= 2
     assert report.corrected == 0
 
@@ -256,7 +249,7 @@ class Uneven(Numbers):
 
 def test_frames_at_uneven_intervals_are_written(tmp_path):
     output = video.VideoOutput(tmp_path / "video.mkv", 30.0)
-    video.run_live(Uneven(), rsv.VibrationTracker(TIMING), [output], drops=False)
+    video.run_live(Uneven(), rsv.VibrationTracker(TIMING), [output])
     times = rsv.read_stack_info(tmp_path / "video.mkv").frame_times
     assert np.array(times) * 30 == pytest.approx([0, 1, 2, 3, 4], abs=0.04)  # of 0, 0.9, 1.3, 2.2, 4.1
 

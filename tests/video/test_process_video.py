@@ -294,17 +294,6 @@ def test_dark_frames_behind_bright_ones_are_no_copies(tmp_path):
     assert np.abs(np.diff(steady)).max() < 1  # px, of compression; 4.6 as copies
 
 
-def test_every_shot_has_its_own_smooth_path(tmp_path):
-    first, second = counts_of(shaken())[:20], counts_of(shaken(pan=-12.0), scene=SCENE[:, ::-1])[20:]
-    steps = []
-    for name, frames in (("first", first), ("second", second), ("both", np.concatenate([first, second]))):
-        source, sink = write(tmp_path / f"{name}.mp4", frames), tmp_path / f"{name}_steady.mp4"
-        process_video(source, sink, TIMING, border="crop", steady=1 / 3, **OPTIONS)
-        steps.append(shifts(pixels(sink).mean(1))[:, 0])
-    assert np.abs(steps[2][:19] - steps[0]).max() < 0.15  # 1.1 with one path of both shots
-    assert np.abs(steps[2][20:30] - steps[1][:10]).max() < 0.15
-
-
 def test_columns_that_are_read_one_after_another(frames, tmp_path):
     turned = np.ascontiguousarray(frames[:16].transpose(0, 2, 1, 3))
     encoded = {"codec": "ffv1", "options": {}, "encoded": "bgr0"}

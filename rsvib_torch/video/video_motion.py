@@ -1,14 +1,17 @@
-"""The motion of all frames of a video, where they are moved to, verdict and record of its parts."""
+"""The motion of all frames of a video: corners of neighbouring frames, what is removed, verdict and record of parts."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
+import cv2
 import numpy as np
 
-from rsvib_torch.execution.parallel import ONE_BLAS_THREAD
-from rsvib_torch.gyroscope.corner_tracks import tracks_of_pairs
+from rsvib_torch.execution.parallel import ONE_BLAS_THREAD, prefetched
+from rsvib_torch.gyroscope.corner_tracks import followed_pair, tracks_of_pairs
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
 from rsvib_torch.gyroscope.rotation_alignment import AlignOptions, RotationAlignment, align_rates
 from rsvib_torch.imaging.trajectory import places_at_rest, recorded_offsets
@@ -17,24 +20,95 @@ from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import ProcessVideoOptions
-from rsvib_torch.registration.corners import Corners
+from rsvib_torch.registration.corners import CornerFollower, Corners, Grey, repetition
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
+from rsvib_torch.stacks.recorded_motion import compared_pairs
 from rsvib_torch.stacks.windows import WindowRecord
-from rsvib_torch.tracking.camera_path import CameraPath, camera_path, shake
+from rsvib_torch.tracking.camera_path import WINDOW_FRAMES, CameraPath, camera_path, shake
 from rsvib_torch.video import Margins
-from rsvib_torch.video.first_pass import CHECKED_FRAMES, PART_FRAMES, FirstPass
 from rsvib_torch.video.part_detection import part_detection, tone_tables
 from rsvib_torch.video.recorded_rotation import RecordedRotation
 from rsvib_torch.video.steadying import steady_shifts
-from rsvib_torch.video.video_frames import FrameTrack, VideoFrames
+from rsvib_torch.video.video_frames import Frame, FrameTrack, VideoFrames
 
+PART_FRAMES = 32  # of a part of the video, which is encoded by itself; an interrupted run repeats at most one part
+CHECKED_FRAMES = 8  # of each part, in which the shaking is measured
+# Of the usual change from frame to frame: at least 0.18 in 36 clips that a hand holds, and at most 0.12 of copies in a
+# video of 24 frames per second that is stored as 30. More frames in a row are no copies: a pan has ended, or it is dark
+_COPY, _MEMORY, _MOST_IN_A_ROW = 0.15, 8, 3
 # Of the distance at which a scene repeats itself, a step from frame to frame, along it, up to which the part of the
 # video shows by how much the frames move; a larger one may be another by the whole distance
 _MOST_OF_REPETITION = 0.25
 # More shaking makes a part, or a video, worse: wrong settings make it 1.5 to 5 times as shaky. 0.1 px is not visible.
 _MORE_SHAKING, _VISIBLE_SHAKING = 1.1, 0.1  # -, px
-_SMALLEST = 0.02  # px at the corners; roll and zoom below are left out, because restoration is faster without
+
+
+class FirstPass:
+    """Follows corners from each usable frame of a video to the next one; copies of the frame before do not count."""
+
+    def __init__(self, frames: VideoFrames, *, for_gyroscope: bool) -> None:
+        self._frames, self._for_gyroscope, self._times = frames, for_gyroscope, frames.middles
+        self.taken = frames.middles  # (N,) s, middle of every frame, and of copies that of the frame before
+        self.faults: dict[int, str] = {}  # number of each frame that cannot be used, with the reason
+        self.corners: dict[int, Corners] = {}  # between a frame and the next one, of the first frames of each part
+        self.compared: dict[int, Array] = {}  # with a gyroscope, likewise, of some frames of the video
+        self.repetitions: dict[int, Array | None] = {}  # without a gyroscope, of each part
+        self._chosen = compared_pairs(len(frames.starts)) if for_gyroscope else []
+        self._before: tuple[int, Grey] | None = None  # the usable frame before, and its number
+        self._changes: deque[float] = deque(maxlen=_MEMORY)  # counts, of the frames before
+        self._waiting: list[tuple[int, Grey, float]] = []  # possible copies of it, and their changes
+        self._follower = CornerFollower(frames.job.timing, compare_blur=not for_gyroscope and not frames.stabilised)
+
+    def pairs(self, progress: Callable[[], None]) -> Iterator[Corners | None]:
+        """Corners between each usable frame and the one before; a thread follows them, up to a window ahead."""
+        with closing(self._frames.decoded()) as frames:
+            known = (self._next(index, frame) for index, frame in enumerate(frames))
+            with closing(prefetched(known, WINDOW_FRAMES)) as followed:
+                for corners in followed:
+                    progress()
+                    yield from corners
+
+    def _next(self, index: int, frame: Frame | str) -> tuple[Corners | None, ...]:
+        """The corners between usable frames that are known with a frame."""
+        if isinstance(frame, str):
+            self.faults[index] = frame
+            return ()
+        grey, before = self._frames.grey(frame), self._before
+        changed = math.inf if before is None else cv2.norm(grey, before[1], cv2.NORM_L1) / grey.size
+        usual = float(np.median(self._changes)) if len(self._changes) >= _MEMORY // 2 else 0.0
+        if before is None or changed > _COPY * usual:
+            self._waiting.clear()
+            return self._used(index, grey, changed)
+        self.taken[index] = self.taken[before[0]]
+        self._waiting.append((index, grey, changed))
+        if len(self._waiting) <= _MOST_IN_A_ROW:
+            return ()
+        waiting, self._waiting = self._waiting, []
+        return tuple(corners for one in waiting for corners in self._used(*one))
+
+    def _used(self, index: int, grey: Grey, changed: float) -> tuple[Corners | None, ...]:
+        """The corners between a frame that is no copy and the usable frame before, if there is one."""
+        self.taken[index], before = self._times[index], self._before
+        if grey.min() == grey.max():
+            self.faults[index] = f"frame {index} is constant"
+            return ()
+        if not self._for_gyroscope and index // PART_FRAMES not in self.repetitions:
+            self.repetitions[index // PART_FRAMES] = repetition(grey)
+        corners = self._follower.next(grey, float(self._frames.starts[index]))
+        self._before = index, grey
+        if before is None:
+            return ()
+        self._changes.append(changed)
+        if before[0] == index - 1:
+            if corners is not None and index % PART_FRAMES < CHECKED_FRAMES:
+                self.corners[index - 1] = corners
+            if index - 1 in self._chosen:
+                self.compared[index - 1] = followed_pair(before[1], grey)
+        if corners is not None and self._frames.stabilised:
+            both = np.broadcast_to(self.taken[[before[0], index]], corners.times.shape)
+            corners = replace(corners, times=both)
+        return (corners,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +160,7 @@ class VideoMotion:
         widest = np.zeros(4)
         for index in range(len(self.frames.starts)):
             if index not in self.found.faults:
-                timing = self.frames.timing_of(0, index)
+                timing = self.frames.timing_of(index)
                 (x, y), _ = recorded_offsets(self.removed(index), timing, self.frames.size)
                 x, y = (x, y) if timing.scan_axis == -2 else (x.T, y.T)
                 sides = [-y[0].min(), y[-1].max(), -x[:, 0].min(), x[:, -1].max()]
@@ -119,7 +193,7 @@ class VideoMotion:
         """Corners between two frames where they are in the restored ones."""
         places: list[Array] = []
         for number, track in enumerate(pair):
-            exposure = self.frames.timing_of(0, track.index).exposure_time
+            exposure = self.frames.timing_of(track.index).exposure_time
             starts = corners.times[:, number] - self.found.taken[track.index] - 0.5 * exposure
             recorded = corners.places + (number - 0.5) * corners.offsets
             places.append(places_at_rest(track.motion, recorded, starts, exposure))
@@ -172,15 +246,15 @@ def video_motion(
     """
     found, timing, middles = FirstPass(frames, for_gyroscope=rates is not None), frames.job.timing, frames.middles
 
-    def to_steady(apart: Callable[[int, slice], Array], cuts: Sequence[int] = ()) -> Array:
-        return steady_shifts(middles, apart, options.steady, frames.size, options.crop_limit, cuts)
+    def to_steady(apart: Callable[[int, slice], Array]) -> Array:
+        return steady_shifts(middles, apart, options.steady, frames.size, options.crop_limit)
 
     if rates is None:
         with ONE_BLAS_THREAD:
             path = camera_path(found.pairs(progress), timing, frames.size, has_tones=not frames.stabilised)
         places = path.places(found.taken)
         _check_repetitions(found.repetitions, places[:, :2])
-        shift = to_steady(lambda number, others: places[others] - places[number], found.cuts)
+        shift = to_steady(lambda number, others: places[others] - places[number])
         polynomials = np.stack([path.derivatives(found.taken, 1), path.derivatives(found.taken, 2), shift], 1)
         polynomials[:, :2] *= not frames.stabilised
 
@@ -189,12 +263,8 @@ def video_motion(
             tones, polynomial = path.tones(float(found.taken[index])), polynomials[index]
             if options.steady == 0:  # axes without vibration stay as taken
                 polynomial = polynomial * np.array([any(tone.axis == axis for tone in tones) for axis in range(4)])
-            height, width = frames.size
-            seconds = 0.5 * timing.row_time * max(height, width)
-            reach = np.abs(polynomial) * np.array([[seconds], [seconds**2], [1.0]])
-            axes = 4 if reach[:, 2:].sum() * 0.5 * math.hypot(height, width) > _SMALLEST else 2
-            amplitude, frequency, phase, *_ = tone_tables(tones, axes)
-            return Vibration(amplitude, frequency, phase, *(values[:axes] for values in polynomial))
+            amplitude, frequency, phase, *_ = tone_tables(tones, 4)
+            return Vibration(amplitude, frequency, phase, *polynomial)
 
         return VideoMotion(frames, path, found, by_corners, options.steady > 0)
     for _ in found.pairs(progress):  # for ``found.compared``, and for ``found.corners``
