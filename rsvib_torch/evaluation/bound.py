@@ -74,7 +74,7 @@ def _information(
     # rows (S, T) of the frames that show each row of the scene, and how many of them per row of the scene: dr / ds
     moved = _of_middle_column(motion, timing, num_frames, height)
     begin = timing.frame_starts(num_frames, device)
-    rows = rows_showing(y[:, None] - top, begin.expand(len(y), num_frames), timing, moved)
+    rows, _ = rows_showing(y[:, None] - top, begin.expand(len(y), num_frames), timing, moved)
     moments = begin + rows * timing.row_time
     seen = ((rows >= 0) & (rows <= height - 1)) * torch.gradient(rows, dim=0)[0]
 

@@ -84,21 +84,17 @@ def exposure_trajectory(
     return vibration.path(starts, times), weights
 
 
-def rows_showing(scene_rows: Tensor, frame_start: Tensor, timing: RowTiming, vibration: Motion) -> Tensor:
-    """Frame rows r(s) that show scene rows s of shape S: the solution of ``r = s + Y(t(r))``, float64.
+def rows_showing(
+    scene_rows: Tensor, frame_start: Tensor, timing: RowTiming, vibration: Motion
+) -> tuple[Tensor, Tensor]:
+    """Frame rows r(s) that show scene rows s of shape S, and their mean displacement (S, 2) in px, float64.
 
+    They are the solution of ``r = s + Y(t(r))``.
     Row r is exposed from ``frame_start + r T_row`` on, and Y is the mean displacement over that exposure (Eq. 2).
     Newton's method; ``|dY/dt| T_row`` is 0.02 for 5 px at 30 Hz, and must stay below 1: content that moves along the
     scan as fast as the rows is never passed. The vibration is in row order, its batch dimensions lead; ``frame_start``
     in s broadcasts to S.
     """
-    return rows_and_displacement(scene_rows, frame_start, timing, vibration)[0]
-
-
-def rows_and_displacement(
-    scene_rows: Tensor, frame_start: Tensor, timing: RowTiming, vibration: Motion
-) -> tuple[Tensor, Tensor]:
-    """``rows_showing``, and the mean displacement (S, 2) of these rows in px."""
     check_two_axes(vibration, "the displacement of a row")
     scene_rows = scene_rows.to(torch.float64)
     rows = scene_rows + torch.zeros_like(frame_start)

@@ -130,8 +130,7 @@ def restore(
     if lost := prepared.lost_rows():
         warn_of_restoration(text_of_lost_rows(lost))
     timing = prepared.image_timing
-    _, count, _, height, _ = prepared.images.shape
-    vibration, left_alone = vibration_to_undo(vibration, timing, count, height)
+    vibration, left_alone = vibration_to_undo(vibration, timing)
     for reason in left_alone:
         warn_of_restoration(str(reason))
     if left_alone and not bool(vibration.moving_axes().any()):

@@ -216,7 +216,7 @@ def restore_trusted(
     if isinstance(motion, MotionDetection):
         vibration, left_alone = reliable_motion(motion)
     else:
-        vibration, left_alone = vibration_to_undo(motion, timing, len(frames), frames.shape[int(timing.scan_axis)])
+        vibration, left_alone = vibration_to_undo(motion, timing)
     frames = frames if first_frames is None else frames[:first_frames]
     joint, scale, optics = options.joint, options.scale, check_optics(options.optics)
     prepared = prepare_frames(frames, timing, saturation=options.saturation, mosaic=options.mosaic)
