@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from rsvib_torch.checks.arguments import check_broadcast, check_images, checked_methods, checks_arguments
 from rsvib_torch.checks.values import check_choice
-from rsvib_torch.execution.parallel import full_precision, outside_graphs
+from rsvib_torch.execution.parallel import at_once, full_precision, outside_graphs, runs
 from rsvib_torch.files.reading import check_fits
 from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
 from rsvib_torch.motion.motion import Motion
@@ -145,20 +145,28 @@ def row_transfer(taps: Tensor, along: Tensor, frequencies: Tensor) -> Tensor:
     return transfer.view(*taps.shape[:-1], -1)
 
 
-def form_rows(spectra: Tensor, first: Tensor, taps: Tensor, along: Tensor, frequencies: Tensor, degree: int) -> Tensor:
-    """Form rows of frames from the spectra of the rows of a scene, which is mirrored beyond its first and last row.
+def form_frames(
+    spectra: Tensor, place: Tensor, along: Tensor, node_weights: Tensor, degree: int, length: int, columns: slice
+) -> Tensor:
+    """Form frames (..., T, R, W) from the spectra of the rows of scenes, which are mirrored beyond their ends (Eq. 9).
 
     The ``spectra`` (..., 1, S, U) of one scene for all frames, or (..., T, S, U) of one for each of T frames, are those
-    of B-spline coefficients, of ``degree`` across the rows. ``first`` (T, R) and ``taps`` are those of ``row_taps`` for
-    these B-splines, ``along`` (T, R, N) are displacements along the rows in px; frequencies (U,) are in cycles per px.
-    The rows are (..., T, R, U).
+    of B-spline coefficients, of ``degree`` across the rows, whose rows are extended to ``length``. At each node of its
+    exposure, a row shows scene row ``place`` (T, R, N), displaced by ``along`` (T, R, N) px along the row. Of the rows,
+    ``columns`` are returned.
     """
+    u = torch.fft.rfftfreq(length, dtype=along.dtype, device=along.device)
+    first, taps = row_taps(place, node_weights, partial(bspline_weights, degree=degree))
     source = first[..., None] + torch.arange(-(degree // 2), taps.shape[-2] - degree // 2, device=first.device)
     scenes, rows = spectra.shape[-3:-1]
     source = mirrored(source, rows) + rows * torch.arange(scenes, device=first.device)[:, None, None]
-    transfer = row_transfer(taps, along, frequencies).to(spectra.dtype)
-    # sum over the taps of each row
-    return (spectra.flatten(-3, -2)[..., source, :] * transfer).sum(-2)
+    formed = []
+    for part in runs(source.shape[1], at_once(16 * taps.shape[-2] * len(u) * len(source), along.device)):
+        transfer = row_transfer(taps[:, part], along[:, part], u).to(spectra.dtype)
+        # sum over the taps of each row
+        of_rows = (spectra.flatten(-3, -2)[..., source[:, part], :] * transfer).sum(-2)
+        formed.append(torch.fft.irfft(of_rows, n=length)[..., columns])
+    return torch.cat(formed, dim=-2)
 
 
 def _gather_index(psf: RowPSF, tap: int, scene_size: tuple[int, int]) -> Tensor:

@@ -49,11 +49,6 @@ def spread_taps(cells: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
 
     Cells (..., N), whole numbers, are those of the first of K consecutive taps (..., N, K). The result is the lowest
     cell (...) of the nodes, int64, and weights (..., N, J) of the J taps from there on, 0 where a node has none.
-
-    Example:
-        >>> first, taps = spread_taps(torch.tensor([3.0, 4.0]), torch.tensor([[0.5, 0.5], [0.75, 0.25]]))
-        >>> first.item(), taps.tolist()
-        (3, [[0.5, 0.5, 0.0], [0.0, 0.75, 0.25]])
     """
     first = cells.detach().amin(-1)
     index = (cells - first[..., None]).to(torch.int64)[..., None] + torch.arange(weights.shape[-1], device=cells.device)

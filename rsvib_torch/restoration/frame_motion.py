@@ -84,10 +84,8 @@ class FrameMotion:
 
         No content is then certain to stay in the frame, and kernels and padding grow with the motion.
         """
-        for direction, bounds, size in zip(
-            ("along", "across"), zip(*self.bounds, strict=True), (width, self.num_rows), strict=False
-        ):
-            bound = max(bounds, key=lambda value: math.inf if math.isnan(value) else value)
+        largest = np.array(self.bounds).max(0)[:2].tolist()
+        for direction, bound, size in zip(("along", "across"), largest, (width, self.num_rows), strict=True):
             if not bound <= size:  # also NaN
                 raise ValueError(
                     f"the motion {direction} the rows reaches {bound:.4g} px within a frame, more than its size of "
@@ -102,11 +100,6 @@ class FrameMotion:
         """Exposure starts of frame rows (B, T, S) in seconds."""
         return self.frame_starts[:, None] + frame_rows * self.timing.row_time
 
-    def mean_displacement(self, frame_rows: Tensor) -> Tensor:
-        """Mean displacement (B, T, S, 2) in px of frame rows (B, T, S) during their exposures, beyond the shift."""
-        starts = self.row_starts(frame_rows)
-        return self.vibration.mean_displacement(starts, self.timing.exposure_time) - self.shift[..., None, :]
-
     @cached_property
     def exposures(self) -> tuple[Tensor, Tensor]:
         """Displacement (B, T, R, N, 2) in px of all rows at N nodes of exposures, with the shift; and weights (N,)."""
@@ -114,6 +107,13 @@ class FrameMotion:
         starts = self.row_starts(rows).expand(*self.shift.shape[:2], self.num_rows)
         with torch.enable_grad():  # the first use may be an estimate without gradients
             return exposure_trajectory(self.vibration, starts, self.timing, "gauss")
+
+    @cached_property
+    def mean_displacement(self) -> Tensor:
+        """Mean displacement (B, T, R, 2) in px of all rows during their exposures, beyond the shift."""
+        displacement, node_weights = self.exposures
+        with torch.enable_grad():
+            return (displacement * node_weights[:, None]).sum(-2) - self.shift[:, :, None]
 
     @cached_property
     def blur_lengths(self) -> NDArray[np.float64]:
@@ -236,12 +236,6 @@ def joint_groups(count: int, joint: bool | int) -> list[tuple[list[int], int]]:
 
     With ``joint=True`` all frames, with the middle one as reference; a number K: every frame with its neighbours, K in
     all; ``False``: every frame by itself. The result is in the coordinates of the reference frame.
-
-    Example:
-        >>> joint_groups(3, True)
-        [([0, 1, 2], 1)]
-        >>> joint_groups(3, 2)
-        [([0, 1], 0), ([1, 2], 1), ([1, 2], 2)]
     """
     if joint is True:
         return [(list(range(count)), count // 2)]
@@ -295,20 +289,7 @@ def restore_in_strips(method: Method, frames: MovingFrames, options: Restoration
 
 
 class RestorationWarning(UserWarning):
-    """A restored frame may be worse than the raw one, or a part of the vibration was not undone.
-
-    Example:
-        >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.datasets import example_frames
-        >>> frames, timing, _ = example_frames()
-        >>> import warnings
-        >>> wrong = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[3.6, 4.1])  # opposite phase
-        >>> with warnings.catch_warnings(record=True) as caught:
-        ...     warnings.simplefilter("always")
-        ...     restored = rsv.restore(frames, timing, wrong)
-        >>> caught[0].category.__name__
-        'RestorationWarning'
-    """
+    """A restored frame may be worse than the raw one, or a part of the vibration was not undone."""
 
 
 def warn_of_restoration(message: str) -> None:

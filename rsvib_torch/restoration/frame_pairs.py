@@ -5,18 +5,16 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 
 import math
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.execution.parallel import at_once, runs
 from rsvib_torch.frames.pixels import cut_columns, detailed_parts
-from rsvib_torch.imaging.blur import form_rows, row_taps
+from rsvib_torch.imaging.blur import form_frames
 from rsvib_torch.motion.motion import ColumnMotion
-from rsvib_torch.numerics.interpolation import bspline_weights, correlated, extended_length, spline_spectra
+from rsvib_torch.numerics.interpolation import correlated, extended_length, spline_spectra
 from rsvib_torch.numerics.tables import Array, tables
 from rsvib_torch.restoration.frame_motion import FrameMotion, MovingFrames, frame_motion
 
@@ -81,20 +79,14 @@ def common_parts(motion: FrameMotion, pairs: NDArray[np.int64], shape: torch.Siz
     """Common parts of pairs (N, 3) of a stack, an earlier and a later frame of it, in frames of a shape."""
     stack, frames, extent = pairs[:, 0], pairs[:, 1:], np.array(shape)
     # rows are displaced by so much beyond the content of their frame, axes (y, x)
-    moved = mean_places(motion)
-    shift, reach = (values[stack[:, None], frames][..., ::-1] for values in tables(motion.shift, moved.abs().amax(-2)))
+    reached = motion.mean_displacement.abs().amax(-2)
+    shift, reach = (values[stack[:, None], frames][..., ::-1] for values in tables(motion.shift, reached))
     step = (shift[:, 1] - shift[:, 0]).astype(np.int64)
     # sizes change in steps, so that many pairs have the same
     unit = np.clip(extent // 32, _MARGIN, 4 * _MARGIN)
     rim = np.ceil((reach.max(1) + _MARGIN) / unit).astype(np.int64) * unit
     size = extent + -abs(step) // unit * unit
     return CommonParts(stack, frames, np.array(motion.bounds)[stack, :2] > 0, step, size, rim)
-
-
-def mean_places(motion: FrameMotion) -> Tensor:
-    """Mean displacement (B, T, R, 2) in px of every row during its exposure, beyond the shift of its frame."""
-    displacement, node_weights = motion.exposures
-    return (displacement * node_weights[:, None]).sum(-2) - motion.shift[:, :, None]
 
 
 def reblur(
@@ -112,19 +104,14 @@ def reblur(
     # displacement of each row during its exposure
     degree, (height, width) = 5, scenes.shape[-2:]
     displacement, node_weights = motion.exposures
-    members = displacement[stack[:, None], frame[:, None], first_row[:, None] + np.arange(height)]
+    rows = np.arange(height)
+    members = displacement[stack[:, None], frame[:, None], first_row[:, None] + rows]
     along, across = (members - motion.shift[stack, frame][:, None, None]).unbind(-1)
-    place = torch.arange(height, device=scenes.device)[:, None] - across
-    # spectra of the spline coefficients (..., N, h, U), and a few rows of the frames at a time
+    place = torch.from_numpy(rows).to(across.device)[:, None] - across
+    # spectra of the spline coefficients (..., N, h, U), and frames
     length = extended_length(width, math.ceil(float(along.abs().amax())))
-    u = torch.fft.rfftfreq(length, dtype=scenes.dtype, device=scenes.device)
     spectra, along = spline_spectra(scenes.movedim(0, -3), degree, length), along.to(scenes.dtype)
-    first, taps = row_taps(place, node_weights, partial(bspline_weights, degree=degree))
-    step = at_once(16 * taps.shape[-2] * len(u) * len(scenes), scenes.device)
-    formed = [
-        form_rows(spectra, first[:, part], taps[:, part], along[:, part], u, degree) for part in runs(height, step)
-    ]
-    return torch.fft.irfft(torch.cat(formed, dim=-2), n=length)[..., :width].movedim(-3, 0)
+    return form_frames(spectra, place, along, node_weights, degree, length, slice(0, width)).movedim(-3, 0)
 
 
 def misfit(first: Tensor, second: Tensor) -> tuple[Array, Array]:

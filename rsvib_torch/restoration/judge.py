@@ -39,7 +39,6 @@ from rsvib_torch.restoration.frame_pairs import (
     CommonParts,
     common_parts,
     judged_columns,
-    mean_places,
     misfit,
     reblur,
 )
@@ -341,7 +340,7 @@ def _judge_pairs(given: MovingFrames, restored: Tensor, common: CommonParts, sha
         (pairs.later - pairs.predicted).square(),
         (pairs.predicted - pairs.restored) * pairs.changed_later,
     ]
-    moved = mean_places(given.motion)[common.stack[:, None], common.frames].diff(dim=1)[:, 0]  # (N, R, 2)
+    moved = given.motion.mean_displacement[common.stack[:, None], common.frames].diff(dim=1)[:, 0]  # (N, R, 2)
     means = [values.mean((1, 2, 3), dtype=torch.float64) for values in squares]
     after, unexplained, change, *offset = table(torch.stack([*means, *moved.square().mean(1).sqrt().unbind(-1)]))
 

@@ -126,8 +126,7 @@ def restore_banded(given: MovingFrames, options: BandedOptions) -> Tensor:
     weight = weights.repeat_interleave(T * len(centres))
 
     # 2. Fourier transforms of the rows, each moved back by its own mean displacement along it, (B T, H, C, U).
-    every_row = torch.arange(H, dtype=torch.float64, device=frames.device).expand(B, T, H)
-    mean = motion.mean_displacement(every_row)[..., 0].flatten(0, 1)
+    mean = motion.mean_displacement[..., 0].flatten(0, 1)
     spectra = torch.fft.rfft(extend_rows(frames, length)).transpose(-3, -2).flatten(0, 1)
     spectra = spectra * shift_phases(mean, length, slice(0, len(u)), spectra.dtype)[:, :, None]
 

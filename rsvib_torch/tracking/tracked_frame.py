@@ -21,7 +21,7 @@ from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.numerics.tables import Array, table, tensor
 from rsvib_torch.options import TrackerOptions
 from rsvib_torch.restoration.frame_motion import visible_pixels
-from rsvib_torch.restoration.restore import restore_prepared, unchanged_frames
+from rsvib_torch.restoration.restore import as_taken, restore_prepared
 
 TrackingState = Literal["searching", "tracking", "unusable"]
 
@@ -96,7 +96,7 @@ class TrackedFrame:
         Another thread may use it while the next frame is tracked.
         """
         if self._as_taken:
-            return unchanged_frames(self.frame, joint=False)[0]
+            return self.frame.from_row_order(as_taken(self.frame, joint=False))[0]
         frame = self._timed_from_middle
         with torch.no_grad():
             return frame.from_row_order(restore_prepared(frame, self.motion, self.options))[0]

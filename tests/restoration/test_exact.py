@@ -17,7 +17,7 @@ from rsvib_torch.restoration import visible_pixels
 from rsvib_torch.restoration.exact import model_frames
 from rsvib_torch.restoration.frame_motion import MovingFrames, frame_motion
 from rsvib_torch.restoration.observation import Observation, RowKernels
-from rsvib_torch.restoration.priors import PRIORS, Prior, shrink_patches
+from rsvib_torch.restoration.priors import PRIORS, shrink_patches
 from rsvib_torch.restoration.scene_prior import RowPrior, fit_prior
 from rsvib_torch.restoration.scene_solver import SceneSolver
 
@@ -77,8 +77,12 @@ def test_results_do_not_depend_on_threads_and_gradients(short, joint, monkeypatc
     allowed = torch.get_num_threads()
     options = {"joint": joint, "check": False}
     found, scenes = [], []
-    gaussian = PRIORS["gaussian"].function
-    counted = Prior(lambda problem, strength: scenes.append(len(problem.data)) or gaussian(problem, strength))
+    gaussian = PRIORS["gaussian"]
+
+    def counted(problem, strength):
+        scenes.append(len(problem.data))
+        return gaussian(problem, strength)
+
     monkeypatch.setitem(PRIORS, "gaussian", counted)
     try:
         for threads in (2, 1):
