@@ -122,12 +122,8 @@ class FrameMotion:
         return (high - low).amax(2).cpu().numpy()
 
 
-def frame_motion(vibration: Motion, timing: RowTiming, frames: int | Tensor, num_rows: int) -> FrameMotion:
-    """Motion of frames of ``num_rows`` rows for a vibration of batch shape (B,) in row order.
-
-    ``frames`` is their number, or their exposure starts (T,) if they are some of a stack.
-    """
-    starts = frames if isinstance(frames, Tensor) else timing.frame_starts(frames, vibration.device)
+def frame_motion(vibration: Motion, timing: RowTiming, starts: Tensor, num_rows: int) -> FrameMotion:
+    """Motion of frames of ``num_rows`` rows that start at ``starts`` (T,) in s, for a vibration (B,) in row order."""
     middle = starts + timing.time_to_middle(num_rows)
     shift = vibration.drift(middle.expand(*vibration.batch_shape, -1)).detach().round()
     return FrameMotion(vibration, timing, starts, shift, num_rows)
@@ -146,7 +142,7 @@ def motion_of_frames(frames: PreparedFrames, vibration: Motion) -> FrameMotion:
         )
     motion = vibration.to_row_order(frames.image_timing).to(frames.images.device)
     motion = motion if motion.batch_shape else motion.expanded(batch)
-    return frame_motion(motion, frames.timing, count, height)
+    return frame_motion(motion, frames.timing, frames.timing.frame_starts(count, motion.device), height)
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,12 +210,13 @@ def visible_pixels(
     for one in [vibration[stack] for stack in range(batch[0])] if batch else [vibration]:
         motion = one.detached()
         bounding: Motion = motion.to_row_order(timing).expanded(1)
-        of_frames = frame_motion(bounding, row_timing, num_frames, rows)
+        starts = row_timing.frame_starts(num_frames, motion.device)
+        of_frames = frame_motion(bounding, row_timing, starts, rows)
         shift = offsets_from_row_order(of_frames.shift, timing)[0, :, :2]
         if not motion.same_for_all_columns:
             ends = torch.tensor([-0.5, 0.5], dtype=torch.float64, device=motion.device) * (columns - 1)
             bounding = ColumnMotion.of_columns(bounding, ends, row_timing, num_frames, rows)
-            of_frames = frame_motion(bounding, row_timing, num_frames, rows)
+            of_frames = frame_motion(bounding, row_timing, starts, rows)
         of_frames.check_fits(columns)
         for frame in range(num_frames):
             # the place in the frame where each pixel of the restored frame was recorded
@@ -277,11 +274,11 @@ def restore_in_strips(method: Method, frames: MovingFrames, options: Restoration
     if motion.vibration.same_for_all_columns:
         motion.check_fits(width)
         return method(frames, options)
-    starts = motion.frame_starts.tolist()
-    end = starts[-1] + height * timing.row_time + timing.exposure_time
-    strips, neglected = _strips(motion.vibration, (height, width), starts[0], end)
+    first, last = motion.frame_starts[[0, -1]].tolist()
+    end = last + height * timing.row_time + timing.exposure_time
+    strips, neglected = _strips(motion.vibration, (height, width), first, end)
     of_strips = ColumnMotion.of_columns(motion.vibration, strips.columns, timing, count, height)
-    of_frames = replace(frame_motion(of_strips, timing, count, height), neglected=neglected)
+    of_frames = replace(frame_motion(of_strips, timing, motion.frame_starts, height), neglected=neglected)
     of_frames.check_fits(width)
     cut = replace(frames.mapped(strips.cut), motion=of_frames, strips=len(strips.firsts))
     restored = method(cut, options)

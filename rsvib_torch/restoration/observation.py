@@ -173,8 +173,8 @@ class RowKernels:
 
     def rows(self, part: slice) -> "RowKernels":
         """Kernels of some neighbouring rows, counted from the first of them."""
-        first, *others = (values[:, part] for values in (self.first, self.taps, self.middle, self.along, self.weight))
-        return RowKernels(first - part.start, *others, self.points)
+        taps, middle, along, weight = (values[:, part] for values in (self.taps, self.middle, self.along, self.weight))
+        return RowKernels(self.first[:, part] - part.start, taps, middle, along, weight, self.points)
 
     def at(self, frequencies: Tensor) -> Tensor:
         """Kernels (M, R, J, Q) without the phase of the middle at the frequency."""

@@ -161,7 +161,7 @@ def _restored(frames: MovingFrames, options: RestorationOptions) -> Tensor:
 
 
 def as_taken(frames: PreparedFrames, joint: bool | int, scale: int = 1) -> Tensor:
-    """The frames as taken, in row order, in place of restored ones: NaN at missing pixels; of all frames the middle one.
+    """The frames as taken, in row order: NaN at missing pixels; with ``joint=True`` the middle one.
 
     On a finer grid, values between the pixels are interpolated.
     """
