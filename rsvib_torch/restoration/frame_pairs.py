@@ -15,7 +15,7 @@ from rsvib_torch.frames.pixels import cut_columns, detailed_parts
 from rsvib_torch.imaging.blur import form_frames
 from rsvib_torch.motion.motion import ColumnMotion
 from rsvib_torch.numerics.interpolation import correlated, extended_length, spline_spectra
-from rsvib_torch.numerics.tables import Array, tables
+from rsvib_torch.numerics.tables import Array, table, tables
 from rsvib_torch.restoration.frame_motion import FrameMotion, MovingFrames, frame_motion
 
 _STRIP = 160  # px, width of the strip of columns that is judged with roll or zoom: enough for the means of a pair
@@ -33,8 +33,8 @@ def judged_columns(given: MovingFrames, restored: Tensor, count: int | None) -> 
     motion, (height, width) = given.motion, given.images.shape[-2:]
     if motion.vibration.same_for_all_columns:
         motion.check_fits(width)
-        apart = motion.shift[..., 0].amax(1) - motion.shift[..., 0].amin(1)
-        beside = 2 * (motion.displacement_bound() + 4 * _MARGIN) + int(apart.max())
+        apart = int(np.ptp(table(motion.shift)[..., 0], axis=1).max())
+        beside = 2 * (motion.displacement_bound() + 4 * _MARGIN) + apart
         if count is None or count + beside >= width:
             return given, restored
         chosen = detailed_parts(given.images, count + beside)
