@@ -15,8 +15,11 @@ def findings_of(texts):
     return tuple(map(findings_of, texts))
 
 
-def detection_of(vibration, relative=1e-3, *, phase=1e-3, reliable=(True, True), reasons=((), ())):
-    """A detection with standard deviations of ``relative`` times the amplitude, of the phase in rad, and 0.01 Hz."""
+def detection_of(vibration, relative=1e-3, *, phase=1e-3, displacement=None, reliable=(True, True), reasons=((), ())):
+    """A detection with standard deviations of ``relative`` times the amplitude, of the phase in rad, and 0.01 Hz.
+
+    That of the ``displacement`` of the rows in px, along x and y, is stated or None.
+    """
     drift = torch.zeros_like(vibration.image_motion)
     return DetectedVibration(
         vibration,
@@ -27,6 +30,7 @@ def detection_of(vibration, relative=1e-3, *, phase=1e-3, reliable=(True, True),
             phase=torch.as_tensor(phase, dtype=torch.float64).expand_as(vibration.phase),
             image_motion=drift + 0.5,
             image_acceleration=drift,
+            displacement=None if displacement is None else torch.tensor(displacement, dtype=torch.float64),
         ),
         gain=torch.ones_like(vibration.amplitude),
         residual=drift,

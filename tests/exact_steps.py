@@ -11,7 +11,9 @@ from rsvib_torch.restoration.frame_motion import MovingFrames, frame_motion, joi
 
 def model_of(frames, timing, vibration, **options):
     """The model of a stack (T, H, W)."""
-    motion = frame_motion(vibration.expanded(1), timing.in_row_order(), len(frames), frames.shape[-2])
+    motion = frame_motion(
+        vibration.expanded(1), timing.in_row_order(), timing.frame_starts(len(frames)), frames.shape[-2]
+    )
     return model_frames(MovingFrames(frames[None, :, None], motion), **options)
 
 

@@ -75,7 +75,6 @@ restore = partial(rsv.restore, timing=TIMING, vibration=VIBRATION)
 CASES = (
     {
         "AngularRates": (rsv.AngularRates, TIMES, TIMES[:, None].repeat(1, 3)),
-        "FixedDewarp": (rsv.FixedDewarp(TIMING, STILL, (ROWS, COLUMNS), 4), FRAMES),
         "FreeMotion": (lambda values: rsv.FreeMotion(values, 0.0, 0.1), torch.zeros(2, 5, dtype=torch.float64)),
         "FreeMotion.through": (rsv.FreeMotion.through, TIMES, TIMES[:, None].repeat(1, 2)),
         "FreeMotion.displacement": (MOTION.displacement, TIMES),
@@ -118,7 +117,7 @@ CASES = (
         "city_and_fields": (lambda: city_and_fields(120, 100, seed=3),),
         "blind_frequencies": (lambda: rsv.blind_frequencies(TIMING, 600.0),),
         "visible_pixels": (lambda: rsv.visible_pixels(TIMING, VIBRATION, (96, 64), 3),),
-        "trusted_vibration": (lambda: rsv.trusted_vibration(REFUSED, TIMING, 3, 96),),
+        "trusted_vibration": (lambda: rsv.trusted_vibration(REFUSED, TIMING),),
         "psf_figure": (lambda: [line.get_ydata() for line in rsv.psf_figure(VIBRATION, TIMING, 96).axes[0].lines],),
         "detect_motion": (lambda frames: rsv.detect_motion(frames, TIMING), FRAMES),
         "detect_motion, batch": (
@@ -147,7 +146,7 @@ CASES = (
 
 ONLY_TENSORS = (
     "Optics", "SensorNoise", "RowVaryingBlur.A_adjoint",
-    "AngularRates", "FixedDewarp", "FreeMotion.displacement", "OffsetCurve",
+    "AngularRates", "FreeMotion.displacement", "OffsetCurve",
     "RollingShutterVibration", "RollingShutterVibration, p=0", "RollingShutterVibration, still",
     "Vibration.displacement", "Vibration.mean_displacement", "Vibration.scaled", "VibrationStd",
     "row_psf", "blur_rows", "blur_rows_adjoint", "RowVaryingBlur",

@@ -57,7 +57,7 @@ def test_channels_last_is_an_option_and_refused_without_it(colour, name):
     refuses(lambda: function(last), re.escape(message))
     refuses(lambda: function(last[0].numpy()), r"one image \(H, W, C\) is frames\[None\]")
     found, expected = function(last, channels="last"), function(colour)
-    for attribute in ("vibration.amplitude", "motion.coefficients", "after", "offsets", "predicted_gain"):
+    for attribute in ("vibration.amplitude", "motion.coefficients", "misfit_after", "offsets", "predicted_gain"):
         values = [found, expected]
         for part in attribute.split("."):
             values = [getattr(value, part, None) for value in values]

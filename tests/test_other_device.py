@@ -97,7 +97,7 @@ WORK = {
     "augmentation": augmented,
     "simulate": lambda images, timing: rsv.simulate_frames(images[0], timing, SHAKE, 2, frame_size=(64, 64)),
     "register": rsv.register_bands,
-    "judge": lambda images, timing: rsv.judge_restoration(images, images.clone(), timing, SHAKE).before,
+    "judge": lambda images, timing: rsv.judge_restoration(images, images.clone(), timing, SHAKE).misfit_before,
 }
 
 

@@ -15,12 +15,12 @@ from torch.nn import functional
 from rsvib_torch.checks.arguments import check_images, checks_arguments
 from rsvib_torch.checks.values import Positive
 from rsvib_torch.frames.prepare import frames_to_row_order
-from rsvib_torch.imaging import exposure_nodes, rows_showing, simulate_frames
+from rsvib_torch.imaging import rows_showing, simulate_frames
 from rsvib_torch.motion.camera import displacement_factors
 from rsvib_torch.motion.motion import ColumnMotion, Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
-from rsvib_torch.numerics.interpolation import extend_rows, fast_length
+from rsvib_torch.numerics.interpolation import extend_rows, fast_length, gauss_legendre
 
 _MARGIN = 16  # px over which the scene closes to a period; 8 and 32 px change these bounds by less than 3e-5
 
@@ -74,7 +74,7 @@ def _information(
     # rows (S, T) of the frames that show each row of the scene, and how many of them per row of the scene: dr / ds
     moved = _of_middle_column(motion, timing, num_frames, height)
     begin = timing.frame_starts(num_frames, device)
-    rows = rows_showing(y[:, None] - top, begin.expand(len(y), num_frames), timing, moved)
+    rows, _ = rows_showing(y[:, None] - top, begin.expand(len(y), num_frames), timing, moved)
     moments = begin + rows * timing.row_time
     seen = ((rows >= 0) & (rows <= height - 1)) * torch.gradient(rows, dim=0)[0]
 
@@ -87,7 +87,8 @@ def _information(
     products = _gradient_products(scene, factors, window.double(), noise, num_frames)  # (S, A, A)
 
     # derivatives (P, S, T, A) of the displacement by the parameters, averaged over the exposures, without their mean
-    times, weights = (value.to(device) for value in exposure_nodes(timing, "gauss", 8))
+    nodes, weights = (value.to(device) for value in gauss_legendre(8))
+    times = nodes * timing.exposure_time
     of_axis = functional.one_hot(axes, factors.shape[-1]).to(weights)
     derivatives = (sensitivity(moments[..., None] + times) @ weights)[..., None] * of_axis[:, None, None]
     mean = (seen[..., None] * derivatives).sum(2, keepdim=True) / seen.sum(1).clamp(min=1e-300)[:, None, None]

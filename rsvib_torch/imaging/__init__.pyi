@@ -1,7 +1,7 @@
 from .blur import RowPSF, RowVaryingBlur, blur_rows, blur_rows_adjoint, row_psf, trajectory_psf
 from .sensor_model import Optics, SensorNoise
 from .simulate import simulate_frames
-from .trajectory import exposure_nodes, exposure_trajectory, gauss_node_count, rows_showing
+from .trajectory import exposure_trajectory, gauss_node_count, rows_showing
 
 __all__ = [
     "Optics",
@@ -10,7 +10,6 @@ __all__ = [
     "SensorNoise",
     "blur_rows",
     "blur_rows_adjoint",
-    "exposure_nodes",
     "exposure_trajectory",
     "gauss_node_count",
     "row_psf",

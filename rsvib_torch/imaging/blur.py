@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from rsvib_torch.checks.arguments import check_broadcast, check_images, checked_methods, checks_arguments
 from rsvib_torch.checks.values import check_choice
-from rsvib_torch.execution.parallel import full_precision, outside_graphs
+from rsvib_torch.execution.parallel import at_once, full_precision, outside_graphs, runs
 from rsvib_torch.files.reading import check_fits
 from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
 from rsvib_torch.motion.motion import Motion
@@ -145,20 +145,28 @@ def row_transfer(taps: Tensor, along: Tensor, frequencies: Tensor) -> Tensor:
     return transfer.view(*taps.shape[:-1], -1)
 
 
-def form_rows(spectra: Tensor, first: Tensor, taps: Tensor, along: Tensor, frequencies: Tensor, degree: int) -> Tensor:
-    """Form rows of frames from the spectra of the rows of a scene, which is mirrored beyond its first and last row.
+def form_frames(
+    spectra: Tensor, place: Tensor, along: Tensor, node_weights: Tensor, degree: int, length: int, columns: slice
+) -> Tensor:
+    """Form frames (..., T, R, W) from the spectra of the rows of scenes, which are mirrored beyond their ends (Eq. 9).
 
     The ``spectra`` (..., 1, S, U) of one scene for all frames, or (..., T, S, U) of one for each of T frames, are those
-    of B-spline coefficients, of ``degree`` across the rows. ``first`` (T, R) and ``taps`` are those of ``row_taps`` for
-    these B-splines, ``along`` (T, R, N) are displacements along the rows in px; frequencies (U,) are in cycles per px.
-    The rows are (..., T, R, U).
+    of B-spline coefficients, of ``degree`` across the rows, whose rows are extended to ``length``. At each node of its
+    exposure, a row shows scene row ``place`` (T, R, N), displaced by ``along`` (T, R, N) px along the row. Of the rows,
+    ``columns`` are returned.
     """
+    u = torch.fft.rfftfreq(length, dtype=along.dtype, device=along.device)
+    first, taps = row_taps(place, node_weights, partial(bspline_weights, degree=degree))
     source = first[..., None] + torch.arange(-(degree // 2), taps.shape[-2] - degree // 2, device=first.device)
     scenes, rows = spectra.shape[-3:-1]
     source = mirrored(source, rows) + rows * torch.arange(scenes, device=first.device)[:, None, None]
-    transfer = row_transfer(taps, along, frequencies).to(spectra.dtype)
-    # sum over the taps of each row
-    return (spectra.flatten(-3, -2)[..., source, :] * transfer).sum(-2)
+    formed = []
+    for part in runs(source.shape[1], at_once(16 * taps.shape[-2] * len(u) * len(source), along.device)):
+        transfer = row_transfer(taps[:, part], along[:, part], u).to(spectra.dtype)
+        # sum over the taps of each row
+        of_rows = (spectra.flatten(-3, -2)[..., source[:, part], :] * transfer).sum(-2)
+        formed.append(torch.fft.irfft(of_rows, n=length)[..., columns])
+    return torch.cat(formed, dim=-2)
 
 
 def _gather_index(psf: RowPSF, tap: int, scene_size: tuple[int, int]) -> Tensor:
@@ -213,20 +221,18 @@ def blur_rows_adjoint(frames: Tensor, psf: RowPSF, scene_shape: tuple[int, ...])
     """
     if len(scene_shape) < 2 or min(scene_shape) < 1:
         raise ValueError(f"scene_shape must be (..., height, width), all at least 1, got {tuple(scene_shape)}")
-    size = (scene_shape[-2], scene_shape[-1])
-    weights = psf.weights.to(frames.dtype)
-    if frames.shape[-2] != weights.shape[-3]:
-        raise ValueError(f"frames must have the {weights.shape[-3]} rows of the kernels, got {frames.shape[-2]}")
-    if frames.shape[-1] != size[1]:
-        raise ValueError(f"scene_shape must have the {frames.shape[-1]} columns of the frames, got {size[1]}")
+    weights, size = psf.weights.to(frames.dtype), (scene_shape[-2], scene_shape[-1])
+    expected = (weights.shape[-3], size[1])
+    if tuple(frames.shape[-2:]) != expected:
+        raise ValueError(
+            f"frames must have the rows of the kernels and the columns of scene_shape, {expected}, got shape "
+            f"{tuple(frames.shape)}"
+        )
     check_broadcast(frames=frames[..., 0, 0], psf=weights[..., 0, 0, 0])
     lead = torch.broadcast_shapes(frames.shape[:-2], weights.shape[:-3])
     summed = zip(reversed(scene_shape[:-2]), reversed(lead), strict=False)
     if len(scene_shape) - 2 > len(lead) or any(one not in (1, many) for one, many in summed):
         raise ValueError(f"scene_shape {tuple(scene_shape)} does not broadcast to the frames {(*lead, *size)}")
-    scene_bytes = math.prod((*lead, *size)) * frames.element_size()
-    if frames.device.type == "cpu" and scene_bytes > 10**7:  # to read the free memory takes 0.5 ms
-        check_fits(f"scenes {(*lead, *size)}", 2 * scene_bytes, "check scene_shape")
     flat = frames.new_zeros(*lead, math.prod(size))
     num_rows, kernel_height, kernel_width = weights.shape[-3:]
     for tap in range(kernel_height):
@@ -236,9 +242,9 @@ def blur_rows_adjoint(frames: Tensor, psf: RowPSF, scene_shape: tuple[int, ...])
         index = _gather_index(psf, tap, size)
         flat = flat.scatter_add(-1, index.flatten(-2).expand(*lead, -1), pixels.flatten(-2))
     scene = flat.unflatten(-1, size).sum_to_size(scene_shape)
-    back: Tensor = torch.func.vjp(lambda pixels: _coefficients(pixels, psf.degree), torch.zeros_like(scene))[1](scene)[
-        0
-    ]
+    # the transpose of the spline filter
+    transpose = torch.func.vjp(lambda pixels: _coefficients(pixels, psf.degree), torch.zeros_like(scene))[1]
+    back: Tensor = transpose(scene)[0]
     return back
 
 
@@ -280,16 +286,13 @@ class RowVaryingBlur(nn.Module):
         check_images({"scene": scene}, {"scene": "... H W"})
         return blur_rows(scene, self.psf)
 
-    def adjoint(self, frames: Tensor, scene_shape: tuple[int, ...]) -> Tensor:
-        """Apply the exact adjoint to frames (..., R, W)."""
-        check_images({"frames": frames}, {"frames": "... R W"})
-        return blur_rows_adjoint(frames, self.psf, scene_shape)
-
     def A(self, x: Tensor, **kwargs: object) -> Tensor:  # noqa: N802 - name that solvers use
         """``forward`` under the name that solvers use; their further keywords are ignored."""
         return self(x)
 
-    def A_adjoint(self, y: Tensor, **kwargs: object) -> Tensor:  # noqa: N802 - name that solvers use
-        """``adjoint`` for scenes with the shape of the frames."""
+    def A_adjoint(  # noqa: N802 - name that solvers use
+        self, y: Tensor, scene_shape: tuple[int, ...] | None = None, **kwargs: object
+    ) -> Tensor:
+        """``blur_rows_adjoint`` of frames (..., R, W), by default for scenes of their shape."""
         check_images({"y": y}, {"y": "... R W"})
-        return self.adjoint(y, tuple(y.shape))
+        return blur_rows_adjoint(y, self.psf, tuple(y.shape) if scene_shape is None else scene_shape)

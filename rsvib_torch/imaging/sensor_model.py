@@ -69,14 +69,10 @@ def filtered(images: Tensor, transfer: Callable[[Tensor, Tensor], Tensor]) -> Te
     return image[..., :height, :width].to(images.dtype).contiguous()
 
 
-def target_optics(scale: int) -> Optics:
-    """Optics of ``sharpened`` images: pixels of the grid behind a Gaussian of half a pixel; MTF 0.19 at Nyquist."""
-    return Optics(sigma=0.5 / scale, pixel=1.0 / scale)
-
-
 def sharpened(images: Tensor, optics: Optics | None, scale: int) -> Tensor:
-    """Restored frames (..., S H, S W) with the response of ``target_optics`` instead of that of a camera.
+    """Restored frames (..., S H, S W) with the response of target optics instead of that of a camera.
 
+    The target are pixels of the grid behind a Gaussian of half a pixel: MTF 0.19 at the Nyquist frequency.
     The restored frames are the posterior mean of the scene after the optics of the camera, and that of what follows by
     a linear filter is the filtered one, so that the prior limits the gain of noise. The filter is ``max(1, H_target /
     max(H_camera, 0.1))``: frequencies that the camera transmits better are not changed. Without ``optics``, none are.
@@ -84,9 +80,11 @@ def sharpened(images: Tensor, optics: Optics | None, scale: int) -> Tensor:
     if optics is None:
         return images
 
+    target = Optics(sigma=0.5 / scale, pixel=1.0 / scale)
+
     def gain(u: Tensor, v: Tensor) -> Tensor:
         response = optics.transfer(scale * u, scale * v).clamp(min=_LEAST_RESPONSE)
-        return (target_optics(scale).transfer(scale * u, scale * v) / response).clamp(min=1.0)
+        return (target.transfer(scale * u, scale * v) / response).clamp(min=1.0)
 
     return filtered(images, gain)
 

@@ -4,7 +4,6 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -13,19 +12,19 @@ from rsvib_torch.checks.arguments import ArrayLike, as_tensor, channels_appear_l
 from rsvib_torch.checks.values import Count, check_single
 from rsvib_torch.files.reading import check_fits
 from rsvib_torch.frames.prepare import frames_from_row_order, frames_to_row_order
-from rsvib_torch.imaging.blur import form_rows, row_taps
+from rsvib_torch.imaging.blur import form_frames
 from rsvib_torch.imaging.sensor_model import SensorNoise
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.motion.camera import largest_in_frame, largest_slope
 from rsvib_torch.motion.motion import ColumnMotion, ColumnStrips, Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
-from rsvib_torch.numerics.interpolation import bspline_coefficients, bspline_weights, extend_rows, fast_length
+from rsvib_torch.numerics.interpolation import bspline_coefficients, extend_rows, fast_length
 
 _DEGREE = 9  # degree of the spline across rows; its error is 2e-5 of the amplitude at a quarter cycle per pixel
 # px between the visible part and the edge of the scene; the prefilter of the spline decays to 4e-4 within it
 _MARGIN = 16
 _SLIDE = 0.032  # px, difference of the displacements of neighbouring strips
-_CHUNK_ROWS = 64  # rows of all frames that are formed at once
+_CHUNK_ROWS = 64  # rows of all frames whose kernels are in memory at once
 
 
 @checks_arguments
@@ -87,7 +86,7 @@ def simulate_frames(
         )
     check_single("vibration", vibration.batch_shape)
     height, width = map(min, frame_size or scene.shape[-2:], scene.shape[-2:])
-    row_bytes = 400 * min(height, _CHUNK_ROWS) + 12 * height  # per column: spectra of a chunk, frames; measured
+    row_bytes = 400 * min(height, _CHUNK_ROWS) + 12 * height  # per column: spectra of some rows, frames; measured
     if scene.device.type == "cpu":
         check_fits(
             f"num_frames={num_frames} frames of {height} x {width} px",
@@ -150,13 +149,10 @@ def _form_rows(scene: Tensor, starts: Tensor, timing: RowTiming, motion: Motion,
     top, left = (height - num_rows) // 2, (scene_width - width) // 2
     length = fast_length(scene_width + 2 * _MARGIN)
     spectra = torch.fft.rfft(extend_rows(bspline_coefficients(scene, _DEGREE, -2), length, hold=0.0))[..., None, :, :]
-    frequencies = torch.fft.rfftfreq(length, dtype=torch.float64, device=scene.device)
-
-    formed = []
-    for chunk in torch.arange(num_rows, device=scene.device).split(_CHUNK_ROWS):
-        displacement, node_weights = exposure_trajectory(motion, starts[:, chunk], timing, "gauss")
-        places = top + chunk[:, None] - displacement[..., 1]
-        first, taps = row_taps(places, node_weights, partial(bspline_weights, degree=_DEGREE))
-        row_spectra = form_rows(spectra, first, taps, displacement[..., 0], frequencies, _DEGREE)
-        formed.append(torch.fft.irfft(row_spectra, n=length)[..., left : left + width])
+    formed, columns = [], slice(left, left + width)
+    for rows in torch.arange(num_rows, device=scene.device).split(_CHUNK_ROWS):
+        displacement, node_weights = exposure_trajectory(motion, starts[:, rows], timing, "gauss")
+        along, across = displacement.unbind(-1)
+        place = top + rows[:, None] - across
+        formed.append(form_frames(spectra, place, along, node_weights, _DEGREE, length, columns))
     return torch.cat(formed, dim=-2).movedim(-3, 0).contiguous()  # frames before channels

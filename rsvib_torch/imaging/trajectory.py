@@ -11,7 +11,7 @@ import torch
 from scipy.interpolate import CubicSpline
 from torch import Tensor
 
-from rsvib_torch.checks.values import check_choice, check_whole_number
+from rsvib_torch.checks.values import check_choice
 from rsvib_torch.motion.camera import displacement_at
 from rsvib_torch.motion.motion import Motion, check_two_axes
 from rsvib_torch.motion.spline import FreeMotion
@@ -40,28 +40,6 @@ def gauss_node_count(vibration: Motion, exposure_time: float, *, at_most: int = 
     return count
 
 
-def exposure_nodes(
-    timing: SensorTiming, quadrature: Quadrature = "midpoint", num_nodes: int | None = None
-) -> tuple[Tensor, Tensor]:
-    """Times within an exposure, from its start, with their weights.
-
-    ``"midpoint"`` is Eq. (25): N_e samples at (i - 1/2) T_row, weight 1/N_e each (a fractional N_e is rounded up and
-    the samples are spread evenly). ``"gauss"`` uses Gauss-Legendre nodes, which give the same integral with far fewer.
-
-    Returns:
-        Times in seconds and weights that sum to 1, both float64 of shape (N,).
-    """
-    check_choice("quadrature", quadrature, ("midpoint", "gauss"))
-    if num_nodes is not None:
-        check_whole_number("num_nodes", num_nodes, at_least=1, at_most=10_000)  # as many rows as an exposure has
-    if quadrature == "gauss":
-        nodes, weights = gauss_legendre(4 if num_nodes is None else num_nodes)
-        return nodes * timing.exposure_time, weights
-    count = math.ceil(timing.exposure_rows - 1e-9) if num_nodes is None else num_nodes
-    times = (torch.arange(count, dtype=torch.float64, device="cpu") + 0.5) / count * timing.exposure_time
-    return times, torch.full((count,), 1.0 / count, dtype=torch.float64, device="cpu")
-
-
 def exposure_trajectory(
     vibration: Motion,
     starts: Tensor,
@@ -71,34 +49,36 @@ def exposure_trajectory(
 ) -> tuple[Tensor, Tensor]:
     """Displacement (S, N, 2) in px at the nodes of exposures from ``starts`` S in s on, and weights (N,) of the nodes.
 
-    Batch dimensions of the vibration lead. There are N_e midpoints (Eq. 25) by default, or ``gauss_node_count`` nodes.
+    ``"midpoint"`` is Eq. (25): N_e samples at (i - 1/2) T_row, weight 1/N_e each (a fractional N_e is rounded up and
+    the samples are spread evenly). ``"gauss"`` uses Gauss-Legendre nodes, which give the same integral with far fewer:
+    ``num_nodes``, or ``gauss_node_count``. Batch dimensions of the vibration lead.
 
     Raises:
         ValueError: If the motion has roll or zoom, see ``displacement_at``.
     """
     check_two_axes(vibration, "the displacement of a row")
-    if quadrature == "gauss" and num_nodes is None:
-        num_nodes = gauss_node_count(vibration, timing.exposure_time)
-    times, weights = exposure_nodes(timing, quadrature, num_nodes)
-    times, weights = times.to(vibration.device), weights.to(vibration.device)
-    return vibration.path(starts, times), weights
+    check_choice("quadrature", quadrature, ("midpoint", "gauss"))
+    if quadrature == "gauss":
+        nodes, weights = gauss_legendre(num_nodes or gauss_node_count(vibration, timing.exposure_time))
+    else:
+        count = math.ceil(timing.exposure_rows - 1e-9)
+        nodes = (torch.arange(count, dtype=torch.float64, device="cpu") + 0.5) / count
+        weights = torch.full_like(nodes, 1.0 / count)
+    nodes, weights = nodes.to(vibration.device), weights.to(vibration.device)
+    return vibration.path(starts, nodes * timing.exposure_time), weights
 
 
-def rows_showing(scene_rows: Tensor, frame_start: Tensor, timing: RowTiming, vibration: Motion) -> Tensor:
-    """Frame rows r(s) that show scene rows s of shape S: the solution of ``r = s + Y(t(r))``, float64.
+def rows_showing(
+    scene_rows: Tensor, frame_start: Tensor, timing: RowTiming, vibration: Motion
+) -> tuple[Tensor, Tensor]:
+    """Frame rows r(s) that show scene rows s of shape S, and their mean displacement (S, 2) in px, float64.
 
+    They are the solution of ``r = s + Y(t(r))``.
     Row r is exposed from ``frame_start + r T_row`` on, and Y is the mean displacement over that exposure (Eq. 2).
     Newton's method; ``|dY/dt| T_row`` is 0.02 for 5 px at 30 Hz, and must stay below 1: content that moves along the
     scan as fast as the rows is never passed. The vibration is in row order, its batch dimensions lead; ``frame_start``
     in s broadcasts to S.
     """
-    return rows_and_displacement(scene_rows, frame_start, timing, vibration)[0]
-
-
-def rows_and_displacement(
-    scene_rows: Tensor, frame_start: Tensor, timing: RowTiming, vibration: Motion
-) -> tuple[Tensor, Tensor]:
-    """``rows_showing``, and the mean displacement (S, 2) of these rows in px."""
     check_two_axes(vibration, "the displacement of a row")
     scene_rows = scene_rows.to(torch.float64)
     rows = scene_rows + torch.zeros_like(frame_start)

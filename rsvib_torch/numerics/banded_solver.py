@@ -73,11 +73,6 @@ class BandedFactor:
     middle: Tensor
     middle_inverse: Tensor
 
-    @property
-    def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Values that define the factor."""
-        return self.upper, self.inverse, self.middle, self.middle_inverse
-
     def split(self, number: int) -> list["BandedFactor"]:
         """Factors of ``number`` equal parts of the batch."""
         ends = (values.unflatten(-1, (2, number, -1)) for values in (self.upper, self.inverse))
@@ -163,7 +158,7 @@ class _Solve(torch.autograd.Function):
             factor = factor_banded(system.clone() if ctx.needs_input_grad[0] else system, len(right_side))
         solution = factor.solve(right_side)
         if any(ctx.needs_input_grad):
-            ctx.save_for_backward(*factor.tensors, solution)
+            ctx.save_for_backward(*vars(factor).values(), solution)
         return solution
 
     @staticmethod
@@ -214,12 +209,12 @@ class InterpolatedFactors:
     """
 
     nodes: Tensor  # (N,) frequencies of the nodes, ascending from the first to the last of all frequencies
-    tensors: tuple[Tensor, ...]  # those of ``BandedFactor``, (..., n, N) instead of (..., S)
+    tensors: tuple[Tensor, ...]  # the fields of a ``BandedFactor``, (..., n, N) instead of (..., S)
 
     @classmethod
     def of(cls, halves: Tensor, nodes: Tensor, count: int) -> "InterpolatedFactors":
         """Factor matrices (H + b, 2 b + 1, 2 n N) as ``factor_banded`` in their own memory."""
-        tensors = factor_banded(halves, count).tensors
+        tensors = vars(factor_banded(halves, count)).values()
         return cls(nodes, tuple(values.unflatten(-1, (-1, len(nodes))).contiguous() for values in tensors))
 
     def at(self, part: slice) -> BandedFactor:

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterator
 from functools import cache
-from math import comb, factorial
 
 import numpy as np
 import torch
@@ -24,7 +23,7 @@ def bspline_weights(fraction: Tensor, degree: int, derivative: int = 0) -> Tenso
     if derivative:
         lower = bspline_weights(fraction, degree - 1, derivative - 1)
         return torch.nn.functional.pad(lower, (1, 0)) - torch.nn.functional.pad(lower, (0, 1))
-    highest, *others = torch.tensor(_polynomials(degree), dtype=fraction.dtype, device=fraction.device)
+    highest, *others = constant(_polynomials, degree, dtype=fraction.dtype, device=fraction.device)
     weights: Tensor = highest
     for lower in others:
         weights = torch.addcmul(lower, weights, fraction[..., None])
@@ -50,11 +49,6 @@ def spread_taps(cells: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
 
     Cells (..., N), whole numbers, are those of the first of K consecutive taps (..., N, K). The result is the lowest
     cell (...) of the nodes, int64, and weights (..., N, J) of the J taps from there on, 0 where a node has none.
-
-    Example:
-        >>> first, taps = spread_taps(torch.tensor([3.0, 4.0]), torch.tensor([[0.5, 0.5], [0.75, 0.25]]))
-        >>> first.item(), taps.tolist()
-        (3, [[0.5, 0.5, 0.0], [0.0, 0.75, 0.25]])
     """
     first = cells.detach().amin(-1)
     index = (cells - first[..., None]).to(torch.int64)[..., None] + torch.arange(weights.shape[-1], device=cells.device)
@@ -63,43 +57,27 @@ def spread_taps(cells: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @cache
-def _polynomials(degree: int) -> tuple[tuple[float, ...], ...]:
+def _polynomials(degree: int) -> Array:
     """Coefficients of the weights as polynomials of the fraction: one row of all taps per power, highest power first.
 
-    ``sum_j (-1)^j binomial(n + 1, j) max(x - j, 0)^n / n!`` is the B-spline of degree n on the knots 0 ... n + 1; tap k
-    is at ``x = fraction + n - k``.
+    Tap k is the B-spline of degree n on the knots 0 ... n + 1 at ``x = fraction + n - k``: ``x / n`` times that of
+    degree n - 1 plus ``(n + 1 - x) / n`` times the same at x - 1.
     """
-
-    def coefficient(tap: int, power: int) -> float:
-        terms = (
-            (-1) ** j * comb(degree + 1, j) * (degree - tap - j) ** (degree - power) for j in range(degree - tap + 1)
-        )
-        return float(comb(degree, power) * sum(terms) / factorial(degree))
-
-    taps = range(degree + 1)
-    return tuple(tuple(coefficient(tap, power) for tap in taps) for power in reversed(taps))
+    powers: Array = np.ones((1, 1))
+    for n in range(1, degree + 1):
+        tap, one, other = np.arange(n + 1), np.pad(powers, ((0, 0), (1, 0))), np.pad(powers, ((0, 0), (0, 1)))
+        rising, constant_part = one - other, (n - tap) * one + (tap + 1) * other
+        powers = (np.pad(rising, ((0, 1), (0, 0))) + np.pad(constant_part, ((1, 0), (0, 0)))) / n
+    return powers
 
 
-_PREFILTERS: dict[tuple[int, bool], tuple[float, ...]] = {}
-
-
-def _prefilter_taps(degree: int, double: bool) -> tuple[float, ...]:
-    """Taps 0, 1, 2 ... of the symmetric inverse filter of the sampled B-spline."""
-    if (degree, double) not in _PREFILTERS:  # ``torch.compile`` looks into this table, but not into that of a cache
-        length = 1024
-        samples = np.array(_polynomials(degree)[-1][:-1])  # at fraction 0
-        kernel = np.roll(np.pad(samples, (0, length - len(samples))), -(len(samples) // 2))
-        inverse = np.fft.irfft(1.0 / np.fft.rfft(kernel).real, n=length)
-        smallest = 1e-9 if double else 3e-8  # of the largest tap; float32 has no more digits
-        reach = int(np.flatnonzero(np.abs(inverse[: length // 2]) > smallest).max()) + 1
-        _PREFILTERS[degree, double] = tuple(inverse[:reach].tolist())
-    return _PREFILTERS[degree, double]
-
-
-def _prefilter(degree: int, samples: Tensor) -> Tensor:
-    """The inverse filter (1, N) in the dtype of the samples."""
-    taps = _prefilter_taps(degree, samples.dtype in (torch.float64, torch.complex128))
-    return torch.tensor(taps[:0:-1] + taps, dtype=samples.dtype, device=samples.device)[None]
+@cache
+def _inverse_filter(degree: int, smallest: float) -> Array:
+    """Symmetric inverse filter (1, N) of the sampled B-spline, cut where it is below ``smallest``."""
+    samples = _polynomials(degree)[-1, :-1]  # at fraction 0
+    kernel = np.roll(np.pad(samples, (0, 1024 - len(samples))), -(len(samples) // 2))
+    inverse = np.fft.fftshift(np.fft.irfft(1.0 / np.fft.rfft(kernel).real))
+    return inverse[None, abs(inverse) > smallest]
 
 
 def mirrored(index: Tensor, length: int) -> Tensor:
@@ -114,15 +92,21 @@ def mirrored(index: Tensor, length: int) -> Tensor:
     return torch.minimum(index, period - index)
 
 
+def _inverse_filter_of(samples: Tensor, degree: int, dim: int) -> tuple[Tensor, Tensor]:
+    """The inverse filter (1, N) for samples, and the samples along ``dim`` that it needs, with mirrored ends."""
+    smallest = 1e-9 if samples.dtype in (torch.float64, torch.complex128) else 3e-8  # float32 has no more digits
+    kernel = constant(_inverse_filter, degree, smallest, dtype=samples.dtype, device=samples.device)
+    length, reach = samples.shape[dim], kernel.shape[-1] // 2
+    return kernel, mirrored(torch.arange(-reach, length + reach, device=samples.device), length)
+
+
 def bspline_coefficient_rows(samples: Tensor, degree: int) -> Iterator[Tensor]:
     """``bspline_coefficients`` across the rows of images: those of consecutive rows, which stay in the cache."""
     on_cpu, height = samples.device.type == "cpu", samples.shape[-2]
     fits = samples.numel() <= (1 << 20 if on_cpu else 1 << 24)  # the cache, or the memory
-    kernel = _prefilter(degree, samples)
-    reach = kernel.shape[-1] // 2
-    index = mirrored(torch.arange(-reach, height + reach, device=samples.device), height)
+    kernel, index = _inverse_filter_of(samples, degree, -2)
     for rows in runs(height, height if fits else 64 if on_cpu else 256):
-        near = samples.index_select(-2, index[rows.start : rows.stop + 2 * reach])
+        near = samples.index_select(-2, index[rows.start : rows.stop + kernel.shape[-1] - 1])
         yield correlated(near, kernel, -2)[0]
 
 
@@ -134,9 +118,7 @@ def bspline_coefficients(samples: Tensor, degree: int, dim: int) -> Tensor:
     """
     if degree == 1:
         return samples
-    kernel, length = _prefilter(degree, samples), samples.shape[dim]
-    reach = kernel.shape[-1] // 2
-    index = mirrored(torch.arange(-reach, length + reach, device=samples.device), length)
+    kernel, index = _inverse_filter_of(samples, degree, dim)
     return correlated(samples.index_select(dim, index), kernel, dim)[0]
 
 

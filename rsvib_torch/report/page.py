@@ -199,8 +199,7 @@ def write_report_page(folder: Path, report: Report) -> list[str]:
     # the motion that was removed, at the centre of the frame
     removed, image_motion = None, torch.zeros(2)
     if result is not None:
-        num_rows = report.frames.shape[int(timing.scan_axis)]
-        removed = trusted_vibration(result, timing, count, num_rows)[0].to("cpu").translation()
+        removed = trusted_vibration(result, timing)[0].to("cpu").translation()
         image_motion = removed.image_motion
     elif report.windows is not None:
         motion = report.windows.windows[0].motion

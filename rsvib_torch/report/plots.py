@@ -26,12 +26,12 @@ from rsvib_torch.evaluation import MtfCurve
 from rsvib_torch.files.atomic import whole
 from rsvib_torch.files.reading import Table
 from rsvib_torch.imaging import row_psf
-from rsvib_torch.imaging.trajectory import exposure_nodes
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.numerics.interpolation import gauss_legendre
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.restoration import RestorationVerdict
@@ -347,8 +347,8 @@ def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: Count) -> Figu
     starts = timing.row_starts(1, num_rows)[0][rows.long()]
     psf = row_psf(vibration, starts, timing)
     centre = psf.centroid().round()
-    nodes, _ = exposure_nodes(timing, "gauss", 32)
-    path = (vibration.displacement(starts[:, None] + nodes) - centre[:, None]).numpy()
+    nodes, _ = gauss_legendre(32)
+    path = (vibration.displacement(starts[:, None] + nodes * timing.exposure_time) - centre[:, None]).numpy()
     first = psf.first_tap - centre
     height, width = psf.weights.shape[-2:]
     last = first + torch.tensor([width - 1, height - 1], device="cpu")

@@ -30,16 +30,15 @@ from rsvib_torch.restoration.finer_grid import (
 from rsvib_torch.restoration.frame_motion import MovingFrames, joint_groups
 from rsvib_torch.restoration.mosaic_scene import restore_mosaic
 from rsvib_torch.restoration.noise import noise_levels
-from rsvib_torch.restoration.observation import SCENE_REACH, TAPS, Observation, RowKernels
+from rsvib_torch.restoration.observation import SCENE_REACH, TAPS, Observation, RowKernels, most_values
 from rsvib_torch.restoration.priors import PRIORS, check_prior
-from rsvib_torch.restoration.scene_prior import RowPrior, brightness, fit_prior, prior_strengths
+from rsvib_torch.restoration.scene_prior import RowPrior, brightness, fit_prior, prior_strengths, sampled_rows
 from rsvib_torch.restoration.scene_solver import (
     FILLED_BLUR_REACH,
     MIN_LEVEL,
     MOST_THREADS,
     SceneProblem,
     measured_values,
-    most_values,
     scene_period,
     with_extension,
     with_missing_values,
@@ -80,8 +79,7 @@ def restore_exact(frames: MovingFrames, options: ExactOptions) -> Tensor:
 
     # 5. On the finer grid, frames that contradict their scene show that the motion is wrong.
     if options.scale != 1:
-        displacement, node_weights = frames.motion.exposures
-        places = (displacement.detach() * node_weights[:, None]).sum(-2)
+        places = frames.motion.mean_displacement.detach()
         warn_of_frames(differences, [places[one, some] for one, some in zip(scenes.stack, scenes.members, strict=True)])
     return images.unflatten(0, (len(frames.images), -1))
 
@@ -155,22 +153,16 @@ class FrameModel(MovingFrames):
         _, first, of_scenes = np.unique(scenes.stack[:, 0] // self.strips, return_index=True, return_inverse=True)
         chosen = take_stacks([scenes], first)
         chosen = replace(chosen, contributes=chosen.contributes & (chosen.moved == 0).all(-1))
-        # cross-validation of as many scenes at a time as the memory allows
-        scene_bytes = 4 * self.images[0, 0].numel() * scenes.members.shape[1]
-        strengths = []
-        for part in runs(len(first), at_once(scene_bytes, self.images.device, cpu_bytes=_FRAME_BYTES)):
-            some = take_stacks([chosen], np.arange(part.start, part.stop))
-            stack_of, member_of = self._indices(some)
-            found = prior_strengths(
-                self.images[stack_of, member_of],
-                self._row_kernels(some),
-                self.prior.of(stack_of[:, 0], member_of),
-                self.level[stack_of].square(),
-                torch.as_tensor(some.blur_reach[:, None], device=self.images.device),
-            )
-            strengths.append(found)
-        result: NDArray[np.float64] = np.concatenate(strengths)[of_scenes]
-        return result
+        stack_of, member_of = self._indices(chosen)
+        rows = sampled_rows(self.images.shape[-2])
+        strengths = prior_strengths(
+            self.images[..., rows, :][stack_of, member_of],
+            self._row_kernels(chosen).rows(rows),
+            self.prior.of(stack_of[:, 0], member_of),
+            self.level[stack_of].square(),
+            torch.as_tensor(chosen.blur_reach[:, None], device=self.images.device),
+        )
+        return strengths[of_scenes]
 
     def kinds(self, scenes: Scenes) -> list[str]:
         """What is missing in the data of each scene: ``"pixels"``, only the ``"extension"``, or ``"nothing"``.
@@ -280,7 +272,7 @@ def solve_scenes(model: FrameModel, scenes: Scenes, options: ExactOptions) -> tu
         some = take_stacks([scenes], np.array(numbers))
         problem = model.problem(some, kind)
         if model.scale == 1:
-            deviations = PRIORS[options.prior].function(problem, options.regularisation)
+            deviations = PRIORS[options.prior](problem, options.regularisation)
         else:
             deviations, difference = finer_scene(problem, width, model.motion.neglected)
             differences.append(difference)

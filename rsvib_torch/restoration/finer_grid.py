@@ -157,10 +157,6 @@ class FrameDifference:
         """Power of noise and differences, in units of the noise power."""
         return max(1 + self.effect**2, self.residual**2)
 
-    def exceeds(self, effect: float, residual: float) -> bool:
-        """Whether the effect, or the residual, is larger than given values and the expected effect explain."""
-        return self.effect > math.hypot(effect, self.expected) or self.residual > math.hypot(residual, self.expected)
-
 
 def _inner(size: int) -> slice:
     """Rows or columns without those at the ends."""
@@ -231,7 +227,7 @@ def finer_scene(problem: SceneProblem, width: int, neglected: float) -> tuple[Te
         # 1. The scene, and the differences of its frames from their prediction.
         solver = replace(problem, precision=factor / relaxed * problem.precision).solver()
         coefficients = solver.fit(problem.data)
-        predicted = solver.predict(coefficients.detach())[0]
+        predicted = problem.observation.A(coefficients.detach())[0]
         difference, excess = _difference(problem, predicted, width, neglected), _excess(problem, predicted, width)
         # 2. A pattern at a few frequencies: weaken the prior there, while the residual decreases.
         before, largest = largest, float(excess.amax())
@@ -242,8 +238,9 @@ def finer_scene(problem: SceneProblem, width: int, neglected: float) -> tuple[Te
             relaxed = relaxed * excess.clamp(min=1.0)
             continue
         # 3. Other differences count as noise, and the prior is weakened nowhere.
-        noticed = difference.exceeds(allowed, _MAX_RESIDUAL)
-        differs = difference.effect > allowed or difference.residual > _MAX_RESIDUAL
+        limits = ((difference.effect, allowed), (difference.residual, _MAX_RESIDUAL))
+        differs = any(value > limit for value, limit in limits)
+        noticed = any(value > math.hypot(limit, difference.expected) for value, limit in limits)
         if not differs or difference.power < 1.2 * factor:
             break
         factor, relaxed = difference.power, torch.ones_like(relaxed)

@@ -24,12 +24,12 @@ from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.values import check_whole_number, described
 from rsvib_torch.files.reading import Table, check_fits
 from rsvib_torch.frames.prepare import PreparedFrames, offsets_from_row_order
-from rsvib_torch.imaging.trajectory import exposure_trajectory, places, recorded_offsets, rows_and_displacement
+from rsvib_torch.imaging.trajectory import exposure_trajectory, places, recorded_offsets, rows_showing
 from rsvib_torch.motion.camera import largest_in_frame, largest_slope
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import ColumnMotion, ColumnStrips, Motion
 from rsvib_torch.motion.timing import MAX_ROWS, RowTiming, SensorTiming
-from rsvib_torch.motion.vibration import Vibration, VibrationStd
+from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.options import RestorationOptions
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
@@ -64,7 +64,7 @@ class FrameMotion:
 
     def frame_rows(self, scene_rows: Tensor) -> tuple[Tensor, Tensor]:
         """Frame rows (B, T, S) that contain rows (S,) of the restored frames, and their ``mean_displacement``."""
-        rows, displacement = rows_and_displacement(
+        rows, displacement = rows_showing(
             scene_rows - self.shift[..., 1, None], self.frame_starts[:, None], self.timing, self.vibration
         )
         return rows, displacement - self.shift[..., None, :]
@@ -84,10 +84,8 @@ class FrameMotion:
 
         No content is then certain to stay in the frame, and kernels and padding grow with the motion.
         """
-        for direction, bounds, size in zip(
-            ("along", "across"), zip(*self.bounds, strict=True), (width, self.num_rows), strict=False
-        ):
-            bound = max(bounds, key=lambda value: math.inf if math.isnan(value) else value)
+        largest = np.array(self.bounds).max(0)[:2].tolist()
+        for direction, bound, size in zip(("along", "across"), largest, (width, self.num_rows), strict=True):
             if not bound <= size:  # also NaN
                 raise ValueError(
                     f"the motion {direction} the rows reaches {bound:.4g} px within a frame, more than its size of "
@@ -102,11 +100,6 @@ class FrameMotion:
         """Exposure starts of frame rows (B, T, S) in seconds."""
         return self.frame_starts[:, None] + frame_rows * self.timing.row_time
 
-    def mean_displacement(self, frame_rows: Tensor) -> Tensor:
-        """Mean displacement (B, T, S, 2) in px of frame rows (B, T, S) during their exposures, beyond the shift."""
-        starts = self.row_starts(frame_rows)
-        return self.vibration.mean_displacement(starts, self.timing.exposure_time) - self.shift[..., None, :]
-
     @cached_property
     def exposures(self) -> tuple[Tensor, Tensor]:
         """Displacement (B, T, R, N, 2) in px of all rows at N nodes of exposures, with the shift; and weights (N,)."""
@@ -116,18 +109,21 @@ class FrameMotion:
             return exposure_trajectory(self.vibration, starts, self.timing, "gauss")
 
     @cached_property
+    def mean_displacement(self) -> Tensor:
+        """Mean displacement (B, T, R, 2) in px of all rows during their exposures, beyond the shift."""
+        displacement, node_weights = self.exposures
+        with torch.enable_grad():
+            return (displacement * node_weights[:, None]).sum(-2) - self.shift[:, :, None]
+
+    @cached_property
     def blur_lengths(self) -> NDArray[np.float64]:
         """Largest range (B, T, 2) of the displacement along (x, y) during the exposure of a row, in px."""
         low, high = self.exposures[0].detach().aminmax(dim=-2)
         return (high - low).amax(2).cpu().numpy()
 
 
-def frame_motion(vibration: Motion, timing: RowTiming, frames: int | Tensor, num_rows: int) -> FrameMotion:
-    """Motion of frames of ``num_rows`` rows for a vibration of batch shape (B,) in row order.
-
-    ``frames`` is their number, or their exposure starts (T,) if they are some of a stack.
-    """
-    starts = frames if isinstance(frames, Tensor) else timing.frame_starts(frames, vibration.device)
+def frame_motion(vibration: Motion, timing: RowTiming, starts: Tensor, num_rows: int) -> FrameMotion:
+    """Motion of frames of ``num_rows`` rows that start at ``starts`` (T,) in s, for a vibration (B,) in row order."""
     middle = starts + timing.time_to_middle(num_rows)
     shift = vibration.drift(middle.expand(*vibration.batch_shape, -1)).detach().round()
     return FrameMotion(vibration, timing, starts, shift, num_rows)
@@ -146,7 +142,7 @@ def motion_of_frames(frames: PreparedFrames, vibration: Motion) -> FrameMotion:
         )
     motion = vibration.to_row_order(frames.image_timing).to(frames.images.device)
     motion = motion if motion.batch_shape else motion.expanded(batch)
-    return frame_motion(motion, frames.timing, count, height)
+    return frame_motion(motion, frames.timing, frames.timing.frame_starts(count, motion.device), height)
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,12 +210,13 @@ def visible_pixels(
     for one in [vibration[stack] for stack in range(batch[0])] if batch else [vibration]:
         motion = one.detached()
         bounding: Motion = motion.to_row_order(timing).expanded(1)
-        of_frames = frame_motion(bounding, row_timing, num_frames, rows)
+        starts = row_timing.frame_starts(num_frames, motion.device)
+        of_frames = frame_motion(bounding, row_timing, starts, rows)
         shift = offsets_from_row_order(of_frames.shift, timing)[0, :, :2]
         if not motion.same_for_all_columns:
             ends = torch.tensor([-0.5, 0.5], dtype=torch.float64, device=motion.device) * (columns - 1)
             bounding = ColumnMotion.of_columns(bounding, ends, row_timing, num_frames, rows)
-            of_frames = frame_motion(bounding, row_timing, num_frames, rows)
+            of_frames = frame_motion(bounding, row_timing, starts, rows)
         of_frames.check_fits(columns)
         for frame in range(num_frames):
             # the place in the frame where each pixel of the restored frame was recorded
@@ -236,12 +233,6 @@ def joint_groups(count: int, joint: bool | int) -> list[tuple[list[int], int]]:
 
     With ``joint=True`` all frames, with the middle one as reference; a number K: every frame with its neighbours, K in
     all; ``False``: every frame by itself. The result is in the coordinates of the reference frame.
-
-    Example:
-        >>> joint_groups(3, True)
-        [([0, 1, 2], 1)]
-        >>> joint_groups(3, 2)
-        [([0, 1], 0), ([1, 2], 1), ([1, 2], 2)]
     """
     if joint is True:
         return [(list(range(count)), count // 2)]
@@ -283,11 +274,11 @@ def restore_in_strips(method: Method, frames: MovingFrames, options: Restoration
     if motion.vibration.same_for_all_columns:
         motion.check_fits(width)
         return method(frames, options)
-    starts = motion.frame_starts.tolist()
-    end = starts[-1] + height * timing.row_time + timing.exposure_time
-    strips, neglected = _strips(motion.vibration, (height, width), starts[0], end)
+    first, last = motion.frame_starts[[0, -1]].tolist()
+    end = last + height * timing.row_time + timing.exposure_time
+    strips, neglected = _strips(motion.vibration, (height, width), first, end)
     of_strips = ColumnMotion.of_columns(motion.vibration, strips.columns, timing, count, height)
-    of_frames = replace(frame_motion(of_strips, timing, count, height), neglected=neglected)
+    of_frames = replace(frame_motion(of_strips, timing, motion.frame_starts, height), neglected=neglected)
     of_frames.check_fits(width)
     cut = replace(frames.mapped(strips.cut), motion=of_frames, strips=len(strips.firsts))
     restored = method(cut, options)
@@ -295,20 +286,7 @@ def restore_in_strips(method: Method, frames: MovingFrames, options: Restoration
 
 
 class RestorationWarning(UserWarning):
-    """A restored frame may be worse than the raw one, or a part of the vibration was not undone.
-
-    Example:
-        >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.datasets import example_frames
-        >>> frames, timing, _ = example_frames()
-        >>> import warnings
-        >>> wrong = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[3.6, 4.1])  # opposite phase
-        >>> with warnings.catch_warnings(record=True) as caught:
-        ...     warnings.simplefilter("always")
-        ...     restored = rsv.restore(frames, timing, wrong)
-        >>> caught[0].category.__name__
-        'RestorationWarning'
-    """
+    """A restored frame may be worse than the raw one, or a part of the vibration was not undone."""
 
 
 def warn_of_restoration(message: str) -> None:
@@ -320,39 +298,8 @@ def warn_of_restoration(message: str) -> None:
     warnings.warn(message, RestorationWarning, stacklevel=level)
 
 
-def displacement_uncertainty(
-    vibration: Vibration, std: VibrationStd, timing: SensorTiming, num_frames: int, num_rows: int
-) -> tuple[Tensor, Tensor]:
-    """Root-mean-square error of the displacement of the rows by standard deviations, and the displacement itself.
-
-    If ``std.displacement`` is given, it is the error; it contains the image motion and all correlations. Otherwise, for
-    ``A sinc(f T_e) sin(2 pi f t + phi)``, the variance of a tone averaged over its period is ``sinc^2 (std_A^2 + A^2
-    std_angle^2) / 2``. The phase at the time origin and the frequency are correlated: the angle is most accurate in the
-    middle of the record. Its variance there, plus the variance by the frequency with the mean squared distance from the
-    middle, is ``std_angle^2``.
-
-    The vibration has the batch shape () or (B,). Uncertainty and displacement (..., 2) are in px, axes (x, y), float64;
-    image motion is not part of either.
-    """
-    starts = timing.frame_starts(num_frames)
-    first, last = float(starts[0]), float(starts[-1]) + num_rows * timing.row_time
-    middle, spread = 0.5 * (first + last), (last - first) ** 2 / 12.0
-    amplitude, moving = vibration.amplitude, vibration.amplitude > 0
-    rate = (2 * math.pi * std.frequency.to(amplitude)).square()
-    angle = (std.phase.to(amplitude).square() - rate * middle**2).clamp(min=0.0) + rate * spread
-    attenuation = 0.5 * torch.sinc(vibration.frequency * timing.exposure_time).square()
-    variance = attenuation * (std.amplitude.to(amplitude).square() + amplitude.square() * angle)
-    variance = torch.where(moving, variance.nan_to_num(nan=math.inf), 0.0)
-    error = variance.sum(-1).sqrt()
-    if std.displacement is not None:
-        error = torch.where(moving.any(-1), std.displacement.to(amplitude), 0.0)
-    return error, (attenuation * amplitude.square()).sum(-1).sqrt()
-
-
 @checks_arguments
-def trusted_vibration(
-    detected: DetectedVibration, timing: SensorTiming, num_frames: int, num_rows: int
-) -> tuple[Vibration, tuple[Reason, ...]]:
+def trusted_vibration(detected: DetectedVibration, timing: SensorTiming) -> tuple[Vibration, tuple[Reason, ...]]:
     """The part of a detected vibration that is accurate enough to be undone.
 
     The amplitude and the image motion of an axis are set to zero if the axis is not reliable, or if the variance of its
@@ -363,8 +310,6 @@ def trusted_vibration(
     Args:
         detected: A detection.
         timing: The sensor.
-        num_frames: Frames to restore.
-        num_rows: Rows of a frame, along the scan axis.
 
     Returns:
         The vibration, and a ``Reason`` for each axis that is not restored.
@@ -376,17 +321,23 @@ def trusted_vibration(
         >>> blind = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 83.0], phase=[0.5, 1.0])  # Hz; 83.3 is blind
         >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, blind, num_frames=2)
         >>> detection = rsv.detect_vibration(frames, timing)
-        >>> vibration, (reason,) = rsv.trusted_vibration(detection, timing, *frames.shape[:2])
+        >>> vibration, (reason,) = rsv.trusted_vibration(detection, timing)
         >>> (vibration.amplitude[:, 0] > 0).tolist(), reason.code, reason.axis
         ([True, False], 'axis_not_reliable', 'y')
     """
-    check_whole_number("num_frames", num_frames, at_least=1)
-    check_whole_number("num_rows", num_rows, at_least=1)
     vibration, std = detected.vibration, detected.std_if_hidden_tone or detected.std
+    amplitude = vibration.amplitude
     reliable = torch.as_tensor(detected.reliable, dtype=torch.bool, device=vibration.device)
-    error, size = (
-        value.to(vibration.device) for value in displacement_uncertainty(vibration, std, timing, num_frames, num_rows)
-    )
+    # rms displacement A sinc(f T_e) / sqrt(2) of the rows, and its standard deviation; if that is not stated, by those
+    # of amplitude and phase
+    attenuation = 0.5 * torch.sinc(vibration.frequency * timing.exposure_time).square()
+    size = (attenuation * amplitude.square()).sum(-1).sqrt()
+    if std.displacement is None:
+        relative = (std.amplitude.to(amplitude) / amplitude).square() + std.phase.to(amplitude).square()
+        error = torch.where(amplitude > 0, attenuation * amplitude.square() * relative, 0.0).sum(-1).sqrt()
+    else:
+        error = torch.where((amplitude > 0).any(-1), std.displacement.to(amplitude), 0.0)
+    error = error.nan_to_num(nan=math.inf)
     accurate = error.square() <= 0.5 * size.square()
     # of all stacks and axes in one transfer
     figures = torch.stack([error, size, reliable.to(error), accurate.to(error)], -1)
@@ -405,13 +356,11 @@ def trusted_vibration(
     return vibration.scaled(reliable & accurate), tuple(left_alone)
 
 
-def vibration_to_undo(
-    vibration: Motion | DetectedVibration, timing: SensorTiming, num_frames: int, num_rows: int
-) -> tuple[Motion, tuple[Reason, ...]]:
+def vibration_to_undo(vibration: Motion | DetectedVibration, timing: SensorTiming) -> tuple[Motion, tuple[Reason, ...]]:
     """A given motion unchanged; of a detection the accurate part, and a reason for each axis not restored."""
     if isinstance(vibration, Motion):
         return vibration, ()
     if not isinstance(vibration, DetectedVibration):
         made_by = DetectedVibration._MADE_BY
         raise TypeError(f"vibration must be a Motion or a DetectedVibration ({made_by}), got {described(vibration)}")
-    return trusted_vibration(vibration, timing, num_frames, num_rows)
+    return trusted_vibration(vibration, timing)

@@ -5,55 +5,51 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 
 import math
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn import functional
 
-from rsvib_torch.execution.parallel import at_once, runs
-from rsvib_torch.frames.pixels import cut_columns, cut_parts, detailed_parts
-from rsvib_torch.imaging.blur import form_rows, row_taps
+from rsvib_torch.frames.pixels import cut_columns, detailed_parts
+from rsvib_torch.imaging.blur import form_frames
 from rsvib_torch.motion.motion import ColumnMotion
-from rsvib_torch.numerics.interpolation import bspline_weights, correlated, extended_length, spline_spectra
-from rsvib_torch.numerics.tables import Array, tables
+from rsvib_torch.numerics.interpolation import correlated, extended_length, spline_spectra
+from rsvib_torch.numerics.tables import Array, table, tables
 from rsvib_torch.restoration.frame_motion import FrameMotion, MovingFrames, frame_motion
 
 _STRIP = 160  # px, width of the strip of columns that is judged with roll or zoom: enough for the means of a pair
 _SMOOTHING = 5.0  # px, standard deviation of the Gaussian in ``misfit``; displacements of up to about 10 px stay linear
 _RIM = math.ceil(3 * _SMOOTHING) + 1  # px; half width of the kernels of ``misfit``
-_NEAR = 8  # px around missing pixels within which the restored frame is a guess
 _MARGIN = 4  # px between the compared pixels and those outside the frame
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class JudgedFrames(MovingFrames):
-    """Raw frames of B stacks in row order, and the frames restored from them."""
+def judged_columns(given: MovingFrames, restored: Tensor, count: int | None) -> tuple[MovingFrames, Tensor]:
+    """Frames and restored frames in the columns by which the restoration is judged: ``count`` or more, None for all.
 
-    restored: Tensor  # as the images, or (B, 1, C, H, W) in the coordinates of the earlier frame of each pair
-
-
-def judged_strip(given: JudgedFrames) -> JudgedFrames:
-    """The part of the frames by which their restoration is judged.
-
-    With roll or zoom, this is a strip of columns: of those in the middle of both halves, the one with more detail.
+    These are the columns with the most detail, and as many beside them as move into them. With roll or zoom, they are a
+    strip in the middle of one half of the frames.
     """
     motion, (height, width) = given.motion, given.images.shape[-2:]
     if motion.vibration.same_for_all_columns:
         motion.check_fits(width)
-        return given
-    strip = min(_STRIP, width // 2)
-    halves = [slice(middle - strip // 2, middle - strip // 2 + strip) for middle in (width // 4, width - width // 4)]
-    both = torch.cat([given.images[:, :1, ..., half] for half in halves], -1)
-    chosen = [halves[0 if detailed.start < strip // 2 else 1] for detailed in detailed_parts(both, strip)]
-    middles = [half.start + 0.5 * (strip - width) for half in chosen]
-    columns = torch.tensor(middles, dtype=torch.float64, device=both.device)
-    starts = tuple(motion.frame_starts.tolist())
-    of_strips = ColumnMotion(motion.vibration, columns, starts, motion.timing.row_time, height)
-    of_frames = frame_motion(of_strips, motion.timing, motion.frame_starts, height)
-    return replace(given.mapped(lambda values: cut_columns(values, chosen)), motion=of_frames)
+        apart = int(np.ptp(table(motion.shift)[..., 0], axis=1).max())
+        beside = 2 * (motion.displacement_bound() + 4 * _MARGIN) + apart
+        if count is None or count + beside >= width:
+            return given, restored
+        chosen = detailed_parts(given.images, count + beside)
+    else:
+        strip = min(_STRIP, width // 2)
+        halves = [slice(place - strip // 2, place - strip // 2 + strip) for place in (width // 4, width - width // 4)]
+        both = torch.cat([given.images[:, :1, ..., half] for half in halves], -1)
+        chosen = [halves[0 if detailed.start < strip // 2 else 1] for detailed in detailed_parts(both, strip)]
+        middles = [half.start + 0.5 * (strip - width) for half in chosen]
+        columns = torch.tensor(middles, dtype=torch.float64, device=both.device)
+        starts = tuple(motion.frame_starts.tolist())
+        of_strips = ColumnMotion(motion.vibration, columns, starts, motion.timing.row_time, height)
+        motion = frame_motion(of_strips, motion.timing, motion.frame_starts, height)
+    cut = replace(given.mapped(lambda values: cut_columns(values, chosen)), motion=motion)
+    return cut, cut_columns(restored, chosen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,82 +79,14 @@ def common_parts(motion: FrameMotion, pairs: NDArray[np.int64], shape: torch.Siz
     """Common parts of pairs (N, 3) of a stack, an earlier and a later frame of it, in frames of a shape."""
     stack, frames, extent = pairs[:, 0], pairs[:, 1:], np.array(shape)
     # rows are displaced by so much beyond the content of their frame, axes (y, x)
-    moved = mean_places(motion)
-    shift, reach = (values[stack[:, None], frames][..., ::-1] for values in tables(motion.shift, moved.abs().amax(-2)))
+    reached = motion.mean_displacement.abs().amax(-2)
+    shift, reach = (values[stack[:, None], frames][..., ::-1] for values in tables(motion.shift, reached))
     step = (shift[:, 1] - shift[:, 0]).astype(np.int64)
     # sizes change in steps, so that many pairs have the same
     unit = np.clip(extent // 32, _MARGIN, 4 * _MARGIN)
     rim = np.ceil((reach.max(1) + _MARGIN) / unit).astype(np.int64) * unit
     size = extent + -abs(step) // unit * unit
     return CommonParts(stack, frames, np.array(motion.bounds)[stack, :2] > 0, step, size, rim)
-
-
-def mean_places(motion: FrameMotion) -> Tensor:
-    """Mean displacement (B, T, R, 2) in px of every row during its exposure, beyond the shift of its frame."""
-    displacement, node_weights = motion.exposures
-    return (displacement * node_weights[:, None]).sum(-2) - motion.shift[:, :, None]
-
-
-@dataclass(frozen=True, eq=False)
-class FramePairs:
-    """The common parts of N pairs of raw frames and of their restored frames, (N, C, h, w) each."""
-
-    earlier: Tensor  # raw
-    later: Tensor  # raw
-    restored: Tensor  # restored from the earlier frame, or the one image of all frames
-    restored_later: Tensor | None  # restored from the later frame; None where there is one image
-    predicted: Tensor  # the later raw frame, formed from ``restored``
-    changed_later: Tensor  # change of the restored later frame by the motion of that frame
-    # (N, 2, C, h, w) bool, pixels of the raw frames without data; they hold the values that the restored frames predict
-    missing: Tensor | None
-
-
-def cut_pairs(given: JudgedFrames, common: CommonParts, detailed: list[slice] | None) -> FramePairs:
-    """Cut pairs of frames to their common parts, which have one size; rows are those of the later frame.
-
-    Of the columns, the ``detailed`` ones of each stack are kept; None for all.
-    """
-    (height, width), (rim_y, rim_x) = common.size[0].tolist(), common.rim[0].tolist()
-    (earlier, later), single = common.frames.T, given.restored.shape[1] == 1
-    first, second = common.firsts[:, 0], common.firsts[:, 1]
-
-    def cut(images: Tensor, frame: NDArray[np.int64], place: NDArray[np.int64]) -> Tensor:
-        return cut_parts(images, (common.stack, frame), place[:, 0], place[:, 1], (height, width))
-
-    # 1. Columns with the most detail, which lie in the part.
-    if detailed is not None:
-        part_width, width = width, min(width, detailed[0].stop - detailed[0].start + 2 * rim_x)
-        starts = np.array([columns.start for columns in detailed])[common.stack] - rim_x
-        inside = np.clip(starts, second[:, 1], second[:, 1] + part_width - width) - second[:, 1]
-        first[:, 1] += inside
-        second[:, 1] += inside
-    # 2. Both restored frames with the motion of the later frame.
-    raw, raw_later = cut(given.images, earlier, first), cut(given.images, later, second)
-    still = cut(given.restored, np.zeros_like(earlier) if single else earlier, first)
-    still_later = still if single else cut(given.restored, later, second)
-    both = torch.stack([still, still_later], 1)
-    predicted, formed_later = reblur(both, given.motion, common.stack, later, second[:, 0]).unbind(1)
-    # 3. Predicted values at missing pixels, and the part that is compared.
-    inner = (..., slice(rim_y, height - rim_y), slice(rim_x, width - rim_x))
-    missing, compared_later = None, still_later
-    if given.ignore is not None:
-        missing = torch.stack([cut(given.ignore, earlier, first), cut(given.ignore, later, second)], 1)
-        of_earlier = reblur(still[:, None], given.motion, common.stack, earlier, first[:, 0])[:, 0]
-        raw = torch.where(missing[:, 0], of_earlier, raw)
-        # what was restored near missing pixels of the earlier frame is a guess, which the later frame does not confirm
-        near = functional.max_pool2d(missing[:, 0].to(raw.dtype), 2 * _NEAR + 1, 1, _NEAR) > 0
-        raw_later = torch.where(missing[:, 1] | (near & (not single)), predicted, raw_later)
-        compared_later = torch.where(near, still, still_later)
-        missing = missing[inner]
-    return FramePairs(
-        raw[inner],
-        raw_later[inner],
-        still[inner],
-        None if single else compared_later[inner],
-        predicted[inner],
-        (formed_later - still_later)[inner],
-        missing,
-    )
 
 
 def reblur(
@@ -176,42 +104,14 @@ def reblur(
     # displacement of each row during its exposure
     degree, (height, width) = 5, scenes.shape[-2:]
     displacement, node_weights = motion.exposures
-    members = displacement[stack[:, None], frame[:, None], first_row[:, None] + np.arange(height)]
+    rows = np.arange(height)
+    members = displacement[stack[:, None], frame[:, None], first_row[:, None] + rows]
     along, across = (members - motion.shift[stack, frame][:, None, None]).unbind(-1)
-    place = torch.arange(height, device=scenes.device)[:, None] - across
-    # spectra of the spline coefficients (..., N, h, U), and a few rows of the frames at a time
+    place = torch.from_numpy(rows).to(across.device)[:, None] - across
+    # spectra of the spline coefficients (..., N, h, U), and frames
     length = extended_length(width, math.ceil(float(along.abs().amax())))
-    u = torch.fft.rfftfreq(length, dtype=scenes.dtype, device=scenes.device)
     spectra, along = spline_spectra(scenes.movedim(0, -3), degree, length), along.to(scenes.dtype)
-    first, taps = row_taps(place, node_weights, partial(bspline_weights, degree=degree))
-    step = at_once(16 * taps.shape[-2] * len(u) * len(scenes), scenes.device)
-    formed = [
-        form_rows(spectra, first[:, part], taps[:, part], along[:, part], u, degree) for part in runs(height, step)
-    ]
-    return torch.fft.irfft(torch.cat(formed, dim=-2), n=length)[..., :width].movedim(-3, 0)
-
-
-def equally_bright(pairs: FramePairs, noise: Tensor) -> FramePairs:
-    """The pairs with the earlier frame, and the images made of it, at the brightness and contrast of the later one.
-
-    Gain and offset are the regression of the later frame on the predicted one, from means over squares of 16 px, which
-    are large beside residual displacements. The ``noise`` power (N,) draws the gain towards 1. Frames that contradict
-    each other keep their brightness.
-    """
-    side = min(16, *pairs.later.shape[-2:])
-    both = torch.stack([pairs.predicted, pairs.later]).flatten(0, 1)
-    means = functional.avg_pool2d(both, side).flatten(2).double().unflatten(0, (2, -1))  # (2, N, C, n)
-    mean, target = means.mean(-1).unbind()
-    predicted, later = means - means.mean(-1, keepdim=True)
-    slope = ((predicted * later).mean((1, 2)) + noise) / (predicted.square().mean((1, 2)) + noise)
-    agrees = slope > 0
-    offset = torch.where(agrees[:, None], target - slope[:, None] * mean, 0.0).to(pairs.later.dtype)[..., None, None]
-    gain = torch.where(agrees, slope, 1.0).to(pairs.later.dtype)[:, None, None, None]
-    adjusted = {
-        name: torch.addcmul(offset, getattr(pairs, name), gain) for name in ("earlier", "restored", "predicted")
-    }
-    changed = gain * pairs.changed_later if pairs.restored_later is None else pairs.changed_later
-    return replace(pairs, **adjusted, changed_later=changed)
+    return form_frames(spectra, place, along, node_weights, degree, length, slice(0, width)).movedim(-3, 0)
 
 
 def misfit(first: Tensor, second: Tensor) -> tuple[Array, Array]:

@@ -134,7 +134,7 @@ def _scene(
     gain = None
     with torch.no_grad():
         coefficients = solver.fit(filled.data)
-        predicted = filled.mixed(solver.predict(coefficients))
+        predicted = filled.mixed(observation.A(coefficients))
         full = torch.where(known, images, predicted[:, :, 0, :, :width].transpose(0, 1) + mean)
         if count > 1:
             # the noise of the frames, and of the scene in its units: relative to white noise in place of the data

@@ -171,14 +171,12 @@ class RowKernels:
         at_rest = TAPS if self.points == 1 else _SPLINE_DEGREE + 1
         return max(2.0 * self.blur_reach, (self.taps.shape[-2] / self.points - at_rest) / self.points) > 1.0
 
-    def rows(self, top: int, count: int) -> "RowKernels":
-        """Kernels of ``count`` rows from row ``top`` on, counted from there."""
-        if count == self.first.shape[1]:
+    def rows(self, part: slice) -> "RowKernels":
+        """Kernels of some neighbouring rows, counted from the first of them."""
+        if part == slice(0, self.first.shape[1]):
             return self
-        first, taps, middle, along, weight = (
-            value[:, top : top + count] for value in (self.first, self.taps, self.middle, self.along, self.weight)
-        )
-        return RowKernels(first - top, taps, middle, along, weight, self.points)
+        taps, middle, along, weight = (values[:, part] for values in (self.taps, self.middle, self.along, self.weight))
+        return RowKernels(self.first[:, part] - part.start, taps, middle, along, weight, self.points)
 
     def at(self, frequencies: Tensor) -> Tensor:
         """Kernels (M, R, J, Q) without the phase of the middle at the frequency."""
@@ -210,6 +208,11 @@ def interpolation_matrix(reach: float, u: Tensor | None, dtype: torch.dtype) -> 
     matrix = np.zeros((2, *series.shape, 2))
     matrix[0, ..., 0] = matrix[1, ..., 1] = series
     return torch.from_numpy(0.25 * (1 + nodes)), torch.from_numpy(matrix.reshape(2 * count, -1))
+
+
+def most_values(device: torch.device) -> int:
+    """Values of the bands in memory at a time: 128 MB on a CPU, 2 GB on a GPU."""
+    return 1 << 24 if device.type == "cpu" else 1 << 28
 
 
 def _stacked(values: Tensor) -> Tensor:
@@ -358,11 +361,6 @@ class Observation:
             self._normal[order] = SmoothBand(left, prior, points * order, 2 * kernels.blur_reach)
         return self._normal[order]
 
-    def weighted(self, weight: Tensor) -> "Observation":
-        """The same with other weights (N M, R) of the rows."""
-        kernels = replace(self.kernels, weight=weight)
-        return type(self)(kernels, self.num_rows, self.period, self.dtype, self.num_scenes)
-
     def at_frequencies(self, u: Tensor, period: int) -> "Observation":
         """The same for rows of another period, at frequencies (U,) in cycles per px on the CPU.
 
@@ -387,8 +385,11 @@ class Observation:
             yield self._places[taps], torch.view_as_complex((left[taps] @ right).unflatten(-1, (-1, 2)))
 
     def A(self, coefficients: Tensor) -> Tensor:  # noqa: N802 - name that solvers use
-        """Frames ``K c`` (N, M, C, R, L) of scenes with coefficients (K, C, N, U)."""
-        return torch.fft.irfft(self.forward(coefficients, slice(0, len(self.u))), n=self.period)
+        """Noiseless frames ``K c`` (N, M, C, R, L) of scenes with coefficients (K, C, N, U)."""
+        values = self._places.shape[1] * coefficients.shape[1]  # of all rows at a frequency
+        parts = runs(len(self.u), max(1, most_values(coefficients.device) // values))  # less memory
+        spectra = [self.forward(coefficients[..., part], part) for part in parts]
+        return torch.fft.irfft(torch.cat(spectra, dim=-1), n=self.period)
 
     def A_adjoint(self, frames: Tensor) -> Tensor:  # noqa: N802 - name that solvers use
         """``K^H W g`` (K, C, N, U) of frames (N, M, C, R, L)."""

@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -17,18 +17,6 @@ from rsvib_torch.restoration.scene_solver import SceneProblem
 _PATCH, _STEP = 8, 2  # px, size and distance of patches; chosen together with the stages of the prior
 _NEIGHBOURS = _PATCH // _STEP  # patches that begin before the next one that shares no pixel
 _LINES = 4  # of patches, each of neighbours, at a time
-
-
-@dataclass(frozen=True)
-class Prior:
-    """An entry of ``PRIORS``."""
-
-    function: Callable[[SceneProblem, float], Tensor]  # the prior, see the contract above ``PRIORS``
-    finer_grid: bool = False  # whether it exists with ``scale=2``, whose solution does not call the function
-    mosaic: bool = False  # whether it exists for colour mosaics, whose solution does not call the function
-    # memory in bytes per pixel and channel of the frames beyond that of the Gaussian prior; measured by
-    # scripts/benchmark.py --only streaming
-    pixel_bytes: int = 12
 
 
 def gaussian(problem: SceneProblem, regularisation: float) -> Tensor:
@@ -73,29 +61,27 @@ def edges(problem: SceneProblem, regularisation: float) -> Tensor:
     return solver.image(coefficients)
 
 
-# The function of a prior is called as function(problem, regularisation) -> scenes, with the factor > 0 on its strength
-# that the precision of the problem already includes. It returns the deviations of N scenes from
-# the mean brightness of their frames, (N, C, R, L) real: rows 0 ... R - 1 in the coordinates of the restored frame, L
-# the period of problem.data, in units of full scale. problem.data (N, M, C, R, L) are complete (missing values are
-# filled) and have zero mean brightness. It may solve with problem.solver(), and with
-# replace(problem, precision=...).solver(): products (p + 1, p + 1, N, U) as from RowPrior.precision define P in
-# c^H P c, which is added to
-# sum_m w_m |g_m - K_m c|^2, so in units of the noise power of data of weight 1 (standard deviation problem.level). It
-# must be differentiable with respect to the data and the precision, must not write to its arguments, and is called from
-# several threads at a time.
-PRIORS: dict[str, Prior] = {
-    "gaussian": Prior(gaussian, finer_grid=True, mosaic=True, pixel_bytes=0),
-    "edges": Prior(edges),
-}
+# A prior is called as function(problem, regularisation) -> scenes, with the factor > 0 on its strength that the
+# precision of the problem already includes. It returns the deviations of N scenes from the mean brightness of their
+# frames, (N, C, R, L) real: rows 0 ... R - 1 in the coordinates of the restored frame, L the period of problem.data, in
+# units of full scale. problem.data (N, M, C, R, L) are complete (missing values are filled) and have zero mean
+# brightness. It may solve with problem.solver(), and with replace(problem, precision=...).solver(): products
+# (p + 1, p + 1, N, U) as from RowPrior.precision define P in c^H P c, which is added to sum_m w_m |g_m - K_m c|^2, so
+# in units of the noise power of data of weight 1 (standard deviation problem.level). It must be differentiable with
+# respect to the data and the precision, must not write to its arguments, and is called from several threads at a time.
+# The finer grid and mosaics have the Gaussian prior only, and solve without calling its function.
+PRIORS: dict[str, Callable[[SceneProblem, float], Tensor]] = {"gaussian": gaussian, "edges": edges}
+# bytes per pixel and channel of the frames, memory of a prior beyond that of the Gaussian one; measured by
+# scripts/benchmark.py --only streaming
+PRIOR_BYTES = 12
 
 
 def check_prior(prior: str, *, scale: int = 1, mosaic: bool = False) -> None:
-    """Refuse a prior that does not exist, or that does not declare the finer grid or mosaics where they are used."""
+    """Refuse a prior that does not exist, or not on the finer grid or for mosaics where they are used."""
     check_choice("prior", prior, tuple(PRIORS))
-    for property_name, used, option in (("finer_grid", scale != 1, f"scale={scale}"), ("mosaic", mosaic, "mosaic")):
-        if used and not getattr(PRIORS[prior], property_name):
-            names = ", ".join(repr(name) for name, entry in PRIORS.items() if getattr(entry, property_name))
-            raise ValueError(f"{option} has prior={names} only, got {prior!r}")
+    if prior != "gaussian" and (scale != 1 or mosaic):
+        option = "mosaic" if mosaic else f"scale={scale}"
+        raise ValueError(f"{option} has prior='gaussian' only, got {prior!r}")
 
 
 def _cosines_of_neighbours(like: Tensor) -> Tensor:

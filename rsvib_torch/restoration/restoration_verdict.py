@@ -14,9 +14,7 @@ from rsvib_torch.text import measured_text, text_table, wrapped
 Outcome = Literal["helps", "unknown", "partly", "worse"]
 OUTCOMES: tuple[Outcome, ...] = ("helps", "unknown", "partly", "worse")  # in order of concern
 
-# fields of a verdict that have one value, and those that have one for each axis
-LEVELS = ("before", "after", "noise", "chi_square", "predicted_gain")
-DISPLACEMENTS = ("misfit_before", "misfit_after", "resolution")
+DISPLACEMENTS = ("misfit_before", "misfit_after", "resolution")  # fields of a verdict with one value for each axis
 
 # Thresholds of the two scores of the verdict, fitted on 720 restorations with known truth, see docs/ablation.md.
 _PARTLY_RESIDUAL = 0.35  # of the displacement between the raw frames; above, a part of the vibration was not undone
@@ -30,22 +28,17 @@ _CROSSTALK = 0.05  # error of a misfit along one axis, relative to the displacem
 class RestorationVerdict(
     JudgedResult,
     units={"misfit_before": "px", "misfit_after": "px", "resolution": "px", "predicted_gain": "dB"},
-    shapes={**dict.fromkeys(LEVELS, "P"), **dict.fromkeys(DISPLACEMENTS, "P 2")},
+    shapes={**dict.fromkeys(DISPLACEMENTS, "P 2"), "predicted_gain": "P"},
 ):
     """Verdict on a restoration from P pairs of frames of one scene.
 
-    Displacements and levels are root-mean-square values over the pixels that both frames contain.
+    Displacements are root-mean-square values over the pixels that both frames contain.
 
     Attributes:
-        before: (P,) difference of the raw frames, moved onto each other by whole pixels, full scale 1.
-        after: (P,) difference of the restored frames; NaN for one image restored jointly from all.
         misfit_before: (P, 2) px, displacement between the raw frames, axes (x, y).
         misfit_after: (P, 2) px, displacement between a raw frame and its prediction, which is the other frame
             restored and blurred by the motion of the first.
         resolution: (P, 2) px, misfits below this cannot be distinguished from zero.
-        noise: (P,) standard deviation of the noise of the raw frames.
-        chi_square: (P,) mean square of that frame's difference from its prediction, over the variance of the noise:
-            1 ... 2 where motion, blur and noise explain the frame.
         predicted_gain: (P,) dB, improvement: estimated PSNR of the restored frames minus that of the raw ones. It is
             valid where the motion is right and complete, NaN where it is not and has the opposite sign of the outcome.
         outcome: For each pair: ``"helps"``; ``"partly"``: the vibration explains only a part of the displacement,
@@ -54,13 +47,9 @@ class RestorationVerdict(
         findings: The ``Reason`` objects of each pair; none where restoration helps. ``reasons`` has their texts.
     """
 
-    before: Tensor
-    after: Tensor
     misfit_before: Tensor
     misfit_after: Tensor
     resolution: Tensor
-    noise: Tensor
-    chi_square: Tensor
     predicted_gain: Tensor
     outcome: tuple[Outcome, ...]
     findings: tuple[tuple[Reason, ...], ...]
@@ -68,18 +57,13 @@ class RestorationVerdict(
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("outcome", "findings"):
-            if len(getattr(self, name)) != len(self.before):
-                raise ValueError(f"{name} must have {len(self.before)} entries, one for each pair of frames")
+            if len(getattr(self, name)) != len(self.predicted_gain):
+                raise ValueError(f"{name} must have {len(self.predicted_gain)} entries, one for each pair of frames")
 
     @property
     def reasons(self) -> tuple[str, ...]:
         """For each pair, the texts of its ``findings``."""
         return tuple("; ".join(reason.with_axis for reason in of_pair) for of_pair in self.findings)
-
-    @property
-    def helped(self) -> Tensor:
-        """(P,) whether the outcome of the pair is ``"helps"``."""
-        return torch.tensor([outcome == "helps" for outcome in self.outcome], device=self.before.device)
 
     @property
     def overall(self) -> Outcome:

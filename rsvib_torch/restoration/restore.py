@@ -130,12 +130,11 @@ def restore(
     if lost := prepared.lost_rows():
         warn_of_restoration(text_of_lost_rows(lost))
     timing = prepared.image_timing
-    _, count, _, height, _ = prepared.images.shape
-    vibration, left_alone = vibration_to_undo(vibration, timing, count, height)
+    vibration, left_alone = vibration_to_undo(vibration, timing)
     for reason in left_alone:
         warn_of_restoration(str(reason))
     if left_alone and not bool(vibration.moving_axes().any()):
-        return unchanged_frames(prepared, options.joint, options.scale)
+        return prepared.from_row_order(as_taken(prepared, options.joint, options.scale))
     motion = motion_of_frames(prepared, vibration)
     restored = _restored(MovingFrames.of(prepared, motion), options)
     if options.check:  # before frames are sharpened: the verdict compares them with raw frames, blurred by the optics
@@ -143,8 +142,8 @@ def restore(
             _warn_if_worse(prepared, restored, motion, options.joint)
     restored = sharpened(restored, camera, options.scale)
     if left_alone and not bool((moves := vibration.moving_axes().any(-1)).all()):  # as such a stack alone
-        as_taken = _as_taken(prepared, options.joint, options.scale)
-        restored = torch.where(moves[:, None, None, None, None], restored, as_taken)
+        unchanged = as_taken(prepared, options.joint, options.scale)
+        restored = torch.where(moves[:, None, None, None, None], restored, unchanged)
     return prepared.from_row_order(restored)
 
 
@@ -161,16 +160,11 @@ def _restored(frames: MovingFrames, options: RestorationOptions) -> Tensor:
         return restore_in_strips(METHODS[options.method], frames, options)
 
 
-def unchanged_frames(frames: PreparedFrames, joint: bool | int, scale: int = 1) -> Tensor:
-    """The frames as taken in place of restored ones: NaN at missing pixels; with ``joint=True`` the middle one.
+def as_taken(frames: PreparedFrames, joint: bool | int, scale: int = 1) -> Tensor:
+    """The frames as taken, in row order: NaN at missing pixels; with ``joint=True`` the middle one.
 
     On a finer grid, values between the pixels are interpolated.
     """
-    return frames.from_row_order(_as_taken(frames, joint, scale))
-
-
-def _as_taken(frames: PreparedFrames, joint: bool | int, scale: int) -> Tensor:
-    """``unchanged_frames`` in row order."""
     images = frames.images.clone() if frames.colours is None else interpolated_colours(frames.filled, frames.colours)
     if frames.missing is not None:
         images = images.masked_fill(frames.missing, math.nan)

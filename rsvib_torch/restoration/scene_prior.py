@@ -145,15 +145,6 @@ def brightness(frames: Tensor) -> Tensor:
     return frames[..., ::8, :].mean((-2, -1))
 
 
-def cut_pieces(images: Tensor, tops: NDArray[np.int64], lefts: NDArray[np.int64], size: tuple[int, int]) -> Tensor:
-    """The pieces (..., n, m, *size) of images (..., H, W) from n rows and m columns on."""
-    rows, columns = (
-        torch.as_tensor(starts[:, None] + np.arange(extent), device=images.device)
-        for starts, extent in zip((tops, lefts), size, strict=True)
-    )
-    return images[..., rows[:, None, :, None], columns[None, :, None, :]]
-
-
 @dataclass(frozen=True, eq=False)
 class ObservedSpectrum:
     """Power spectra of pieces of the frames of N stacks, whose rows were moved back by their displacement."""
@@ -216,7 +207,10 @@ def observed_spectrum(frames: Tensor, motion: FrameMotion, levels: Tensor, lengt
 
     # phases that move rows back by their displacement, and the taper across rows
     displacement, node_weights = motion.exposures
-    rows = torch.as_tensor(tops[:, None] + np.arange(size[0]), device=frames.device)
+    rows, columns = (
+        torch.as_tensor(starts[:, None] + np.arange(extent), device=frames.device)
+        for starts, extent in zip((tops, lefts), size, strict=True)
+    )
     mean = (displacement[:, :, rows, :, 0] * node_weights).sum(-1)
     back = waves(mean, -u).to(frames.dtype.to_complex()) * tapers[0][:, None]  # (N, T, n, rows, U)
     # power of the pieces, mean over channels and columns of pieces, some rows of pieces at a time
@@ -225,7 +219,7 @@ def observed_spectrum(frames: Tensor, motion: FrameMotion, levels: Tensor, lengt
     step = at_once(piece_bytes, frames.device, cpu_bytes=2**24)
     powers = []
     for chosen in runs(len(tops), step):
-        pieces = cut_pieces(frames, tops[chosen], lefts, size)  # (N, T, C, n, m, rows, columns)
+        pieces = frames[..., rows[chosen, None, :, None], columns[:, None]]  # (N, T, C, n, m, rows, columns)
         spectra = torch.fft.rfft(pieces.sub_(bright[..., None]).mul_(tapers[1])).mul_(back[:, :, None, chosen, None])
         powers.append(squared_modulus(torch.fft.fft(spectra, dim=-2)).mean((2, 4)).transpose(-2, -1))
     power = torch.cat(powers, dim=2).to(torch.float64)
@@ -304,6 +298,12 @@ _FREQUENCIES = 16  # at which rows are sampled; 12 and 24 give the same results,
 _ROWS = 256  # sampled, from the middle of the frames
 
 
+def sampled_rows(height: int) -> slice:
+    """The rows of frames by which the strength of the prior is selected."""
+    count = min(height, _ROWS)
+    return slice((height - count) // 2, (height - count) // 2 + count)
+
+
 @torch.no_grad()
 def prior_strengths(
     images: Tensor, kernels: RowKernels, prior: RowPrior, noise_power: Tensor, blur_reach: Tensor
@@ -314,15 +314,14 @@ def prior_strengths(
     quiet. A stronger one predicts pixels better where the noise is correlated, stronger in bright areas, or due to
     compression.
 
-    The images (S, M, C, R, W) are in row order; ``noise_power`` (S, 1) is that of images of weight 1.
+    The images (S, M, C, R, W) and kernels are those of the ``sampled_rows``; ``noise_power`` (S, 1) is that of images
+    of weight 1.
     """
     height, width = images.shape[-2:]
     if min(height, width) < 64:  # too few values for a choice
         return np.ones(len(images))
     # 1. Fits with the prior at all strengths, at frequencies from 0.02 cycles per px, below which the taper mixes them.
-    rows, frequencies = min(height, _ROWS), min(_FREQUENCIES, width // 4)
-    top = (height - rows) // 2
-    chosen = np.linspace(0.02 * width, width // 2, frequencies, dtype=np.float32).astype(np.int64)
+    chosen = np.linspace(0.02 * width, width // 2, min(_FREQUENCIES, width // 4), dtype=np.float32).astype(np.int64)
     place = torch.from_numpy(np.rint(chosen / width * 2 * (prior.power.shape[-1] - 1)).astype(np.int64))
     scenes, members, number = *prior.interpolation_power.shape[:2], len(_STRENGTHS)
     at = RowPrior(*(values[..., place.to(values.device)] for values in vars(prior).values()))
@@ -330,7 +329,7 @@ def prior_strengths(
     of_all = at.of(stacks.repeat(number), frames)
     strength = torch.from_numpy(_STRENGTHS.repeat(scenes)[:, None]).to(noise_power)
     precisions = of_all.precision(noise_power.repeat(number, 1), strength, blur_reach.repeat(number, 1))
-    power, rest = unexplained(images[..., top : top + rows, :], kernels.rows(top, rows), chosen, precisions)
+    power, rest = unexplained(images, kernels, chosen, precisions)
     # 2. ``n |r|^2 / (n - freedom)^2`` of Craven and Wahba (1979) estimates the squared error of predicting a pixel from
     # all others. The sum over the frequencies is dominated by those with the largest errors; the geometric mean gives
     # all the same weight. The weaker of the two selected priors is used: with the sum alone, five of 124 restorations

@@ -30,7 +30,7 @@ from rsvib_torch.numerics.banded_solver import (
 )
 from rsvib_torch.numerics.interpolation import extend_rows, extended_length, fast_length
 from rsvib_torch.restoration.frame_motion import FrameMotion
-from rsvib_torch.restoration.observation import Observation, frequencies_of
+from rsvib_torch.restoration.observation import Observation, frequencies_of, most_values
 
 MOST_THREADS = 2  # that solve systems side by side; more wait for each other's calls from Python
 MIN_LEVEL = 1e-5  # of full scale, lowest noise level assumed; below, the systems lose digits in single precision
@@ -61,11 +61,6 @@ def join_windows(values: Tensor, windows: list[slice]) -> Tensor:
     borders = [0, *((before.stop + after.start) // 2 for before, after in pairwise(windows)), windows[-1].stop]
     parts = zip(windows, pairwise(borders), strict=True)
     return torch.cat([values[a - w.start : b - w.start, ..., k, :] for k, (w, (a, b)) in enumerate(parts)])
-
-
-def most_values(device: torch.device) -> int:
-    """Values of the bands in memory at a time: 128 MB on a CPU, 2 GB on a GPU."""
-    return 1 << 24 if device.type == "cpu" else 1 << 28
 
 
 class SceneSolver:
@@ -159,11 +154,6 @@ class SceneSolver:
             return torch.cat([solve(number) for number in numbers], dim=-1)
         return torch.cat(in_parallel(solve, numbers, given.device, at_most=MOST_THREADS), dim=-1)
 
-    def predict(self, coefficients: Tensor) -> Tensor:
-        """Noiseless frames (N, M, C, R, L) of the scenes, ``K c``."""
-        spectra = [self.observation.forward(coefficients[..., part], part) for part in self._parts]  # less memory
-        return torch.fft.irfft(torch.cat(spectra, dim=-1), n=self.observation.period)
-
     def image(self, coefficients: Tensor) -> Tensor:
         """Rows of the scenes where the frame at rest would observe them, (N, C, R, L); twice as many if finer."""
         return self.observation.image(coefficients)
@@ -236,39 +226,30 @@ def with_missing_values(
     """The problem, with its solver, with missing values replaced by what the solution for all other data predicts.
 
     The missing values x solve ``x = (K c(x))`` where they are, with the solution c(x) for the filled data. Conjugate
-    gradients, each step of which is one fast solution, start from the solution of the most complete frames, until the
-    residual is ``accuracy`` times the noise level. The lower bounds ``floor`` (N, M, C, R, L) of saturated pixels are
-    held approximately, by two rounds of an active set: at the beginning of each, values that are predicted below their
-    bound are set to it, and count as ``measured`` (N, M, C or 1, R, L) from then on. Channels are filled independently.
+    gradients, each step of which is one fast solution, end when the residual is ``accuracy`` times the noise level. The
+    lower bounds ``floor`` (N, M, C, R, L) of saturated pixels are held approximately, by two rounds of an active set:
+    at the beginning of each, values that are predicted below their bound are set to it, and count as ``measured`` (N,
+    M, C or 1, R, L) from then on. Channels are filled independently.
     """
     data, mixing = problem.mixed(problem.data), problem.mixing
 
     # The inner product of conjugate gradients weights rows as the least-squares problem does.
-    weight = problem.observation.kernels.weight.unflatten(0, data.shape[:2])
-    row_weight = weight.to(data.dtype)[:, :, None, :, None]
+    weight = problem.observation.kernels.weight.unflatten(0, data.shape[:2]).to(data.dtype)[:, :, None, :, None]
     together = (1, 3, 4) if mixing is None else (0, 1, 3, 4)
 
     def dot(first: Tensor, second: Tensor) -> Tensor:
-        return (row_weight * first * second).sum(together, keepdim=True)
+        return (weight * first * second).sum(together, keepdim=True)
 
     def of_scenes(values: Tensor) -> Tensor:
         return values if mixing is None else torch.einsum("nc,c...->n...", mixing, values)
 
-    def prediction(solver: SceneSolver, values: Tensor) -> Tensor:
-        return problem.mixed(solver.predict(solver.fit(of_scenes(values))))
+    def prediction(values: Tensor) -> Tensor:
+        return problem.mixed(problem.observation.A(solver.fit(of_scenes(values))))
 
     def residual_of(values: Tensor, missing: Tensor) -> Tensor:
-        return torch.where(missing, values - prediction(solver, values), 0.0)
+        return torch.where(missing, values - prediction(values), 0.0)
 
-    # Start from the prediction of the most complete frames, to a tenth.
-    share = measured.flatten(2).to(weight.dtype).mean(2)
-    most_complete = share >= 0.9 * share.amax(1, keepdim=True)
-    start = solver
-    if not bool(most_complete.all()):
-        observation = problem.observation.weighted((weight * most_complete[:, :, None]).flatten(0, 1))
-        start = replace(problem, observation=observation).solver()
-    data = torch.where(measured, data, prediction(start, data))
-
+    data = torch.where(measured, data, prediction(data))
     rounds = 1 if floor is None else 2
     for _ in range(rounds):
         # Values predicted below their bound are set to it.

@@ -12,7 +12,7 @@ import psutil
 from rsvib_torch.files.reading import check_fits, free_memory, size_text
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.options import OptionTable, ProcessStackOptions
-from rsvib_torch.restoration.priors import PRIORS
+from rsvib_torch.restoration.priors import PRIOR_BYTES
 from rsvib_torch.text import quoted
 
 # bytes; of the process with its libraries, and of a window independent of its size; peaks measured by
@@ -60,7 +60,7 @@ def memory_needed(
         pixel_bytes = min(_PIXEL_BYTES.values())
     else:
         pixel_bytes = _PIXEL_BYTES.get(restoration.get("method", "exact"), max(_PIXEL_BYTES.values()))
-        pixel_bytes += PRIORS[restoration.get("prior", "gaussian")].pixel_bytes
+        pixel_bytes += PRIOR_BYTES * (restoration.get("prior", "gaussian") != "gaussian")
     mosaic = restoration is not None and restoration.get("mosaic") is not None and not on_gpu
     if mosaic or (restoration is not None and restoration.get("scale", 1) != 1):  # mosaics are solved on the finer grid
         pixel_bytes *= _FINER

@@ -28,7 +28,7 @@ from rsvib_torch.options import RestorationOptions
 from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError
 from rsvib_torch.restoration.frame_motion import vibration_to_undo
 from rsvib_torch.restoration.judge import judge_prepared
-from rsvib_torch.restoration.restore import check_optics, restore_prepared, unchanged_frames, warn_of_mosaic
+from rsvib_torch.restoration.restore import as_taken, check_optics, restore_prepared, warn_of_mosaic
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
 
@@ -216,14 +216,14 @@ def restore_trusted(
     if isinstance(motion, MotionDetection):
         vibration, left_alone = reliable_motion(motion)
     else:
-        vibration, left_alone = vibration_to_undo(motion, timing, len(frames), frames.shape[int(timing.scan_axis)])
+        vibration, left_alone = vibration_to_undo(motion, timing)
     frames = frames if first_frames is None else frames[:first_frames]
     joint, scale, optics = options.joint, options.scale, check_optics(options.optics)
     prepared = prepare_frames(frames, timing, saturation=options.saturation, mosaic=options.mosaic)
     lost = prepared.lost_rows()
     if not bool(vibration.moving_axes().any()):
-        as_taken = unchanged_frames(prepared, joint, scale)
-        return RestoredFrames(as_taken, False, left_alone, None, lost_rows=lost)
+        unchanged = prepared.from_row_order(as_taken(prepared, joint, scale))
+        return RestoredFrames(unchanged, False, left_alone, None, lost_rows=lost)
     warn_of_mosaic(prepared)
     restored = restore_prepared(prepared, vibration, options)
     verdict = None
@@ -233,7 +233,7 @@ def restore_trusted(
     keep = verdict is None or verdict.overall != "worse" or force
     if keep:
         restored = sharpened(restored, optics, scale)
-    result = prepared.from_row_order(restored) if keep else unchanged_frames(prepared, joint, scale)
+    result = prepared.from_row_order(restored if keep else as_taken(prepared, joint, scale))
     return RestoredFrames(result, keep, left_alone, verdict, vibration.num_axes, lost)
 
 

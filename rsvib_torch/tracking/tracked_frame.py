@@ -20,7 +20,7 @@ from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.numerics.tables import Array, table, tensor
 from rsvib_torch.options import TrackerOptions
-from rsvib_torch.restoration.restore import restore_prepared, unchanged_frames
+from rsvib_torch.restoration.restore import as_taken, restore_prepared
 
 TrackingState = Literal["searching", "tracking", "unusable"]
 
@@ -87,7 +87,7 @@ class TrackedFrame:
         Another thread may use it while the next frame is tracked.
         """
         if not bool(self.motion.moving_axes().any()):
-            return unchanged_frames(self.frame, joint=False)[0]
+            return self.frame.from_row_order(as_taken(self.frame, joint=False))[0]
         # the time origin of the motion is the middle of the frame
         half = self.frame.timing.time_to_middle(self.frame.images.shape[-2])
         timing = replace(self.frame.image_timing, frame_start_times=(-half,))

@@ -33,7 +33,6 @@ from harness import Rows, table
 from scipy.optimize import linear_sum_assignment
 
 import rsvib_torch as rsv
-from rsvib_torch.restoration.frame_motion import displacement_uncertainty
 
 OPTIONS = {
     "honesty_classes": (tuple(CLASSES), "honesty: classes of recordings", CLASSES),
@@ -163,8 +162,8 @@ def judge_axis(found: rsv.DetectionResult, taken: Recording, axis: int) -> dict[
         truths.append(without_trend(taken.displacement_by(true), taken.starts))
     error, size = min((rms(without_trend(shown, stated.numpy()) - truth), rms(truth)) for truth in truths)
     stds = found.std if turns else found.std_if_hidden_tone or found.std
-    of_rows, _ = displacement_uncertainty(found.vibration, stds, taken.timing, num_frames, height)
-    std = arm * float(of_rows[axis])
+    moves = bool((found.vibration.amplitude[axis] > 0).any())
+    std = arm * float(stds.displacement[axis]) if moves else 0.0
     # 2. The outcome.
     tones, wrong_number = tone_errors(found, true, axis) if has_tones else ([], False)
     wrong_parameter = any(

@@ -157,7 +157,7 @@ def rows_and_displacements(
 ) -> tuple[Tensor, Tensor]:
     """Rows of frame ``index`` in which rows of the scene appear, and their mean displacements (N, 2)."""
     start = timing.frame_starts(index + 1)[index]
-    shown_by = rows_showing(scene_rows.double(), start, timing, truth)
+    shown_by, _ = rows_showing(scene_rows.double(), start, timing, truth)
     return shown_by, truth.mean_displacement(start + shown_by * timing.row_time, timing.exposure_time)
 
 

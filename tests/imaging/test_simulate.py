@@ -78,7 +78,7 @@ def test_rows_showing_is_the_fixed_point():
     timing = SensorTiming(row_time=40e-6, exposure_rows=60, frame_rows=320).in_row_order()
     vibration = Vibration([6.0, 5.0], [640.0, 1060.0], [0.3, -0.9])
     rows, start = torch.arange(300.0, dtype=torch.float64), torch.tensor(timing.frame_period, dtype=torch.float64)
-    found = rows_showing(rows, start, timing, vibration)
+    found, _ = rows_showing(rows, start, timing, vibration)
     mean = vibration.mean_displacement(start + found * timing.row_time, timing.exposure_time)[..., 1]
     assert (found - rows - mean).abs().max() < 1e-6
     assert (found - rows).abs().max() > 0.6

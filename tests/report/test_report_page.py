@@ -35,7 +35,7 @@ def result_of(vibration=SHAKE, reliable=(True, True), reasons=((), ())):
 
 def verdict_of(outcome, *reasons):
     pair, one = torch.zeros(1, 2), torch.full((1,), 3.0)
-    return RestorationVerdict(one, one, pair, pair, pair, one, one, one, (outcome,), (reasons,))
+    return RestorationVerdict(pair, pair, pair, one, (outcome,), (reasons,))
 
 
 def report_of(**changes):

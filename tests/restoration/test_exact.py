@@ -17,7 +17,7 @@ from rsvib_torch.restoration import visible_pixels
 from rsvib_torch.restoration.exact import model_frames
 from rsvib_torch.restoration.frame_motion import MovingFrames, frame_motion
 from rsvib_torch.restoration.observation import Observation, RowKernels
-from rsvib_torch.restoration.priors import PRIORS, Prior, shrink_patches
+from rsvib_torch.restoration.priors import PRIORS, shrink_patches
 from rsvib_torch.restoration.scene_prior import RowPrior, fit_prior
 from rsvib_torch.restoration.scene_solver import SceneSolver
 
@@ -77,8 +77,12 @@ def test_results_do_not_depend_on_threads_and_gradients(short, joint, monkeypatc
     allowed = torch.get_num_threads()
     options = {"joint": joint, "check": False}
     found, scenes = [], []
-    gaussian = PRIORS["gaussian"].function
-    counted = Prior(lambda problem, strength: scenes.append(len(problem.data)) or gaussian(problem, strength))
+    gaussian = PRIORS["gaussian"]
+
+    def counted(problem, strength):
+        scenes.append(len(problem.data))
+        return gaussian(problem, strength)
+
     monkeypatch.setitem(PRIORS, "gaussian", counted)
     try:
         for threads in (2, 1):
@@ -164,7 +168,7 @@ def test_boundary_extensions_are_filled_at_the_ends_of_the_rows_only():
         return torch.cat([images[..., 24:-24, :24], images[..., 24:-24, -24:]], -1)
 
     # the inner one of three strips ends where it has no weight
-    of_three = frame_motion(motion.expanded(3), timing.in_row_order(), 1, 192)
+    of_three = frame_motion(motion.expanded(3), timing.in_row_order(), timing.frame_starts(1), 192)
     inner = model_frames(MovingFrames((frame + noise).expand(3, 1, 1, -1, -1), of_three, strips=3), noise=0.005)
     filled, not_filled = (psnr(at_ends(image), at_ends(expected[0]), 1.0) for image in solved(inner)[:2])
     assert filled > not_filled + 0.5
@@ -297,7 +301,7 @@ def test_noise_of_bright_areas_is_removed():
 @pytest.mark.parametrize("count", [1, 2])
 def test_power_of_pure_noise_is_close_to_zero(count):
     noise = torch.randn(count, 1, 512, 512, generator=torch.Generator().manual_seed(0))
-    motion = frame_motion(MOTION.vibration().expanded(1), TIMING, count, 512)
+    motion = frame_motion(MOTION.vibration().expanded(1), TIMING, TIMING.frame_starts(count), 512)
     prior = fit_prior((0.5 + 0.02 * noise)[None], motion, torch.full((1, count), 0.02), 576)
     assert prior.power.mean() < 0.08 * 0.02**2
     assert fit_prior((0.5 + 0.04 * noise)[None], motion, torch.full((1, count), 0.02), 576).power.mean() > 2 * 0.02**2

@@ -144,7 +144,7 @@ def test_missing_and_saturated_pixels(scene, frames):
 def test_gradient_of_the_least_squares_solution():
     """Of conjugate gradients for missing values of colours, which couple the components."""
     generator = torch.Generator().manual_seed(1)
-    motion = frame_motion(VIBRATION.expanded(1), TIMING.in_row_order(), 2, 24)
+    motion = frame_motion(VIBRATION.expanded(1), TIMING.in_row_order(), TIMING.frame_starts(2), 24)
     displacement, node_weights = motion.exposures
     kernels = RowKernels.of_rows(displacement[0].repeat(3, 1, 1, 1), node_weights, torch.ones(6), 24, points=2)
     observation = Observation(kernels, 24, 32, torch.float64, 3)

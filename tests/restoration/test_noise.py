@@ -15,7 +15,7 @@ TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
 
 
 def levels(frames, motion):
-    rowwise = frame_motion(motion.vibration().expanded(1), TIMING, len(frames), frames.shape[-2])
+    rowwise = frame_motion(motion.vibration().expanded(1), TIMING, TIMING.frame_starts(len(frames)), frames.shape[-2])
     return noise_levels(torch.as_tensor(frames)[None, :, None], rowwise)[0]
 
 
@@ -54,7 +54,7 @@ def exposed(rows, count):
     """Frames (T, 1, H, W) with noise 0.01, and their motion."""
     timing = replace(TIMING, exposure_rows=rows)
     frames = recorded((256, 208), timing, Motion(), count, 0.01, seed=12)[:, None]
-    return frames, frame_motion(Motion().vibration().expanded(1), timing, count, frames.shape[-2])
+    return frames, frame_motion(Motion().vibration().expanded(1), timing, timing.frame_starts(count), frames.shape[-2])
 
 
 @pytest.mark.parametrize(("rows", "dead"), [(20, "black"), (100, "not measured")])
@@ -96,7 +96,8 @@ def test_frames_without_content_have_no_noise(count, case):
         case, torch.rand(count, 1, 160, 160)
     )
     ignore = torch.ones(frames.shape, dtype=torch.bool) if case == "all missing" else None
-    motion = frame_motion(Motion().vibration().expanded(1), TIMING.in_row_order(), count, frames.shape[-2])
+    starts = TIMING.frame_starts(count)
+    motion = frame_motion(Motion().vibration().expanded(1), TIMING.in_row_order(), starts, frames.shape[-2])
     before = frames.clone()
     found = noise_levels(frames[None], motion, None if ignore is None else ignore[None])
     assert found.shape == (1, count)

@@ -79,7 +79,6 @@ def test_correct_vibration_helps(scene, name, noise, scale):
     frames = frames_of(scene(name), timing, motion, noise)
     verdict, restored = judged(frames, timing, motion.vibration())
     assert verdict.overall == "helps", verdict.sentence
-    assert verdict.helped.all()
     assert (verdict.misfit_after < (0.2 * verdict.misfit_before).clamp(min=0.05)).all()
     # the displacement between the frames, from its own formula
     times = timing.row_starts(2, HEIGHT).numpy() + timing.exposure_time / 2
@@ -91,9 +90,6 @@ def test_correct_vibration_helps(scene, name, noise, scale):
         return
     gain = decibel(restored[1], crop(scene(name))) - decibel(frames[1], crop(scene(name)))
     assert float(verdict.predicted_gain) == pytest.approx(gain, abs=4.0)
-    if noise == 0.02:
-        assert 1.0 < float(verdict.chi_square) < 3.0
-        assert float(verdict.noise) == pytest.approx(noise, rel=0.1)
 
 
 @pytest.mark.parametrize("name", ["buildings", "chart"])
@@ -113,7 +109,6 @@ def test_wrong_vibration_is_rejected(scene, name, noise, scale, wrong):
     frames = frames_of(scene(name), timing, motion, noise)
     verdict, _ = judged(frames, timing, WRONG[wrong](motion).vibration())
     assert verdict.overall in ("partly", "worse"), verdict.sentence
-    assert not verdict.helped.any()
     if wrong == "half amplitude":
         ratio = verdict.misfit_after / verdict.misfit_before
         assert (ratio > 0.4).all()
@@ -139,7 +134,6 @@ def test_blind_vibration_is_unknown(scene, noise):
     for vibration in (motion.vibration(), motion.scaled(0.5).vibration()):
         verdict, _ = judged(frames, camera(), vibration)
         assert verdict.overall == "unknown"
-        assert not verdict.helped.any()
         assert "all are displaced alike" in verdict.sentence
 
 
@@ -168,7 +162,6 @@ def test_noise_or_smoothing_larger_than_the_correction_is_rejected(scene, name, 
     verdict, restored = judged(frames, timing, motion.vibration(), **options)
     assert decibel(restored, still) < decibel(frames, still) - loss
     assert verdict.overall == "worse"
-    assert (float(verdict.chi_square) > 100) == (loss == 10)
     with pytest.warns(RestorationWarning, match="restored is no better than raw"):
         restore(frames, timing, motion.vibration(), **options)
 
@@ -189,9 +182,7 @@ def test_push_scan_frames_are_compared_where_they_overlap(image_motion):
     motion = Motion(image_motion=image_motion)
     frames = frames_of(draw_scene(448, 400, seed=41), timing, motion, 0.005, count=3)
     verdict, _ = judged(frames, timing, motion.vibration())
-    assert verdict.helped.all()
     assert verdict.outcome == ("helps", "helps")
-    assert (verdict.after < 0.01).all()  # mainly the noise of 0.005 in two frames
     wrong = Motion(motion.amplitude, motion.frequency, (motion.phase[0] + 3, motion.phase[1] + 3), image_motion)
     assert judged(frames, timing, wrong.vibration())[0].overall == "worse"
 

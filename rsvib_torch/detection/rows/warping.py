@@ -48,7 +48,7 @@ class Positions:
         cls, scene_rows: Tensor, columns: Tensor, starts: Tensor, timing: RowTiming, motion: Motion
     ) -> "Positions":
         """Positions of given scene rows in frames that start at ``starts`` (B, G, 1)."""
-        rows = rows_showing(scene_rows, starts, timing, motion)
+        rows, _ = rows_showing(scene_rows, starts, timing, motion)
         along = motion.mean_displacement(starts + rows * timing.row_time, timing.exposure_time)[..., 0]
         return cls(scene_rows, columns, rows, along - columns, starts + rows * timing.row_time)
 
