@@ -62,6 +62,7 @@ from .report import save_figure as save_figure
 from .report import windows_figure as windows_figure
 from .report import write_offsets as write_offsets
 from .report import write_table as write_table
+from .restoration import FixedDewarp as FixedDewarp
 from .restoration import RestorationVerdict as RestorationVerdict
 from .restoration import RestorationWarning as RestorationWarning
 from .restoration import VibrationRestorer as VibrationRestorer

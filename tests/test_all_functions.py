@@ -75,6 +75,7 @@ restore = partial(rsv.restore, timing=TIMING, vibration=VIBRATION)
 CASES = (
     {
         "AngularRates": (rsv.AngularRates, TIMES, TIMES[:, None].repeat(1, 3)),
+        "FixedDewarp": (rsv.FixedDewarp(TIMING, STILL, (ROWS, COLUMNS), 4), FRAMES),
         "FreeMotion": (lambda values: rsv.FreeMotion(values, 0.0, 0.1), torch.zeros(2, 5, dtype=torch.float64)),
         "FreeMotion.through": (rsv.FreeMotion.through, TIMES, TIMES[:, None].repeat(1, 2)),
         "FreeMotion.displacement": (MOTION.displacement, TIMES),
@@ -146,7 +147,7 @@ CASES = (
 
 ONLY_TENSORS = (
     "Optics", "SensorNoise", "RowVaryingBlur.A_adjoint",
-    "AngularRates", "FreeMotion.displacement", "OffsetCurve",
+    "AngularRates", "FixedDewarp", "FreeMotion.displacement", "OffsetCurve",
     "RollingShutterVibration", "RollingShutterVibration, p=0", "RollingShutterVibration, still",
     "Vibration.displacement", "Vibration.mean_displacement", "Vibration.scaled", "VibrationStd",
     "row_psf", "blur_rows", "blur_rows_adjoint", "RowVaryingBlur",

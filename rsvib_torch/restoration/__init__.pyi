@@ -3,8 +3,10 @@ from .judge import TooLittleInCommonError, judge_restoration
 from .noise import estimate_noise
 from .restoration_verdict import RestorationVerdict
 from .restore import VibrationRestorer, check_optics, restore
+from .row_methods import FixedDewarp
 
 __all__ = [
+    "FixedDewarp",
     "RestorationVerdict",
     "RestorationWarning",
     "TooLittleInCommonError",

@@ -188,6 +188,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
         result[f"restore {method}"] = call(rsv.restore, method=method, check=method == "exact", **chosen)
     augmentation(frames[:, None])
     constructed: dict[str, Call] = {
+        "FixedDewarp": call(rsv.FixedDewarp, num_frames=3),
         "FreeMotion": call(rsv.FreeMotion, coefficients=recorded.coefficients, start=0.0, tones=vibration),
         "RollingShutterVibration": call(rsv.RollingShutterVibration, **random_tones, exposure_rows=(4.0, 8.0), tones=1),
         "RowVaryingBlur": call(rsv.RowVaryingBlur, frame_width=64, origin=(4, 4), scene_size=(160, 128)),
@@ -201,6 +202,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     modules = {"VibrationDetector": detector, "VibrationRestorer": restorer, "RollingShutterVibration": augmentation}
     for name, module in modules.items():
         result[f"{name}.forward"] = call(module.forward)
+    result["FixedDewarp.forward"] = Call(rsv.FixedDewarp(timing, vibration, (96, 64), 3).forward, {"frames": frames})
     result["RollingShutterVibration.drawn_vibration"] = call(augmentation.drawn_vibration)
     report = rsv.process_stack(stack, folder / "again.npy", timing, **windows)
     described = (detected.std, curve, optics, sensor_noise, info, report, verdict, calibration, camera)

@@ -44,6 +44,10 @@ def augment(images=None, **options):
     return augmentation.drawn_vibration() if images is None else augmentation(images)
 
 
+def dewarp(**changes):
+    return rsv.FixedDewarp(**{"timing": TIMING, "vibration": VIBRATION, "size": (96, 64), "num_frames": 2} | changes)
+
+
 def free(coefficients, *tones):
     return rsv.FreeMotion(coefficients, 0.0, 1e-3, *tones)
 
@@ -249,6 +253,12 @@ def test_pixels_beyond_all_scales(value):
         (lambda: augment(torch.zeros(1, 1, 400, 8)), "less than the 400 rows"),
         (lambda: augment(torch.rand(2, 48, 64, 3)), r"have their channels last: pass images.movedim\(-1, -3\)"),
         (lambda: augment(torch.rand(48, 64, 3)), r"have their channels last: pass images.movedim\(-1, -3\)"),
+        (lambda: dewarp(vibration=VIBRATION.expanded(2)), "vibration is a batch"),
+        (lambda: dewarp(vibration=ROLL), "roll, zoom or a camera"),
+        (lambda: dewarp(size=(500, 90)), "500"),
+        (lambda: dewarp(vibration=rsv.Vibration(500.0, 50.0)), "more than its size"),
+        (lambda: dewarp()(FRAMES[:1]), r"frames must be stacks of .* = \(2, 96, 64\)"),
+        (lambda: dewarp()(FRAMES.double()), r"frames must be torch\.float32"),
         (lambda: flicker(torch.ones(1, 64, 64)), "100% of the pixels are saturated"),
         (lambda: flicker(torch.full((2, 128, 64), 0.5)), "no flicker found"),
         (lambda: flicker(torch.rand(1, 16, 64)), "16 rows along the scan"),

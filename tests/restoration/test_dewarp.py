@@ -1,4 +1,4 @@
-"""Methods ``"dewarp"`` and ``"banded"``: what they undo, and their boundaries."""
+"""Methods ``"dewarp"`` and ``"banded"``, and ``FixedDewarp``: the same result, without graph breaks and in ONNX."""
 
 from functools import partial
 
@@ -36,6 +36,56 @@ def test_sinusoids_are_interpolated_exactly():
     restored = dewarp(frame[None], timing, motion.vibration())[0].numpy()
     assert abs(restored - scene(rows, columns))[16:-16, 24:-24].max() < 2e-3
     assert abs(frame.numpy() - scene(rows, columns))[16:-16, 24:-24].max() > 1
+
+
+VIBRATION = rsv.Vibration([2.1, 1.6], [110.0, 90.0], [0.5, 1.0], image_motion=(40.0, 20.0))
+
+
+def recording(**layout):
+    """Timing, two colour frames (2, 3, 72, 90), the module for them and the result that it must have."""
+    timing = rsv.SensorTiming(row_time=1e-4, exposure_rows=10, frame_rows=120, **layout)
+    scene = torch.from_numpy(draw_scene(120, 140, seed=3)).float().expand(3, -1, -1)
+    frames = rsv.simulate_frames(scene, timing, VIBRATION, num_frames=2, frame_size=(72, 90))
+    fixed = rsv.FixedDewarp(timing, VIBRATION, (72, 90), num_frames=2)
+    return timing, frames, fixed, dewarp(frames, timing, VIBRATION, check=False)
+
+
+@pytest.mark.parametrize("layout", [{}, {"scan_axis": -1}, {"readout_direction": "reverse"}])
+def test_result_is_that_of_restore(layout):
+    timing, frames, fixed, expected = recording(**layout)
+    for stack in (frames, frames[:, 0], torch.stack([frames, frames.flip(-1)])):
+        restored = dewarp(stack, timing, VIBRATION, check=False)
+        torch.testing.assert_close(fixed(stack), restored, atol=5e-6, rtol=0)
+    assert (expected - frames).abs().max() > 0.05
+
+
+def test_graph_has_no_break():
+    _, frames, fixed, expected = recording()
+    compiled = torch.compile(fixed, fullgraph=True, backend="eager")
+    torch.testing.assert_close(compiled(frames), expected, atol=5e-6, rtol=0)
+
+
+@pytest.mark.filterwarnings("ignore:`isinstance:FutureWarning")  # of PyTorch, within its exporter
+def test_onnx_and_exported_program_give_the_same_result(tmp_path):
+    onnxruntime = pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnxscript")
+    _, frames, fixed, expected = recording()
+    program = torch.export.export(fixed, (frames,))
+    torch.testing.assert_close(program.module()(frames), expected, atol=5e-6, rtol=0)
+    torch.onnx.export(program, (), tmp_path / "dewarp.onnx", verbose=False)
+    session = onnxruntime.InferenceSession(tmp_path / "dewarp.onnx")
+    (restored,) = session.run(None, {session.get_inputs()[0].name: frames.numpy()})
+    np.testing.assert_allclose(restored, expected, atol=1e-5)
+
+
+def test_gradient_reaches_the_frames():
+    _, frames, fixed, _ = recording()
+    weights = torch.rand(frames.shape, generator=torch.Generator().manual_seed(1))
+    given = frames.clone().requires_grad_()
+    (fixed(given) * weights).sum().backward()
+    change = torch.rand(frames.shape, generator=torch.Generator().manual_seed(2))
+    along = ((fixed(frames + change) - fixed(frames)).double() * weights).sum()  # the module is linear
+    assert float((given.grad.double() * change).sum()) == pytest.approx(float(along), rel=1e-4)
 
 
 def test_boundaries_are_not_periodic():
