@@ -309,18 +309,12 @@ class ResourceOptions:
 
 
 @options
-class StackDetectionOptions(WindowOptions, ResourceOptions):
-    """Detection in windows."""
+class StackOptions(WindowOptions, ResourceOptions):
+    """Options of ``iterate_stack``."""
 
     detection: OptionTable = None
     """Options of ``detect_vibration``. Without any, ``detect_motion`` measures windows in which no steady vibration
     explains the frames, e.g. because it decays, if more axes are reliable then."""
-
-
-@options
-class StackOptions(StackDetectionOptions):
-    """Options of ``iterate_stack``."""
-
     restoration: OptionTable = None
     """Options of ``restore``, for frames whose full scale is 1; without ``saturation``, integer frames are saturated at
     the level of ``"auto"``. With ``joint=True``, every window becomes one image."""
@@ -329,22 +323,11 @@ class StackOptions(StackDetectionOptions):
 
 
 @options
-class ProgressOptions:
-    """What is called while a stack is processed."""
+class FileRunOptions:
+    """A run from file to file."""
 
     progress: Progress = None
     """Called with the number of complete frames and of all frames."""
-
-
-@options
-class DetectStackOptions(StackDetectionOptions, ProgressOptions):
-    """Options of ``detect_stack``."""
-
-
-@options
-class FileRunOptions(ProgressOptions):
-    """A run from file to file."""
-
     resume: bool = Field(default=False, json_schema_extra=COMMAND_LINE)
     """Whether to continue an interrupted run; a complete output is not changed."""
     manifest: FilePath = None
@@ -360,8 +343,6 @@ class ProcessStackOptions(FileRunOptions, StackOptions):
     motion: object = None
     """A ``FreeMotion`` of all frames to use instead of detections, such as a recorded one (``align_motion``): in image
     axes, with the exposure start of the first row of frame 0 as time origin. Frames are restored to its place 0."""
-    compression: str | None = Field(default=None, json_schema_extra=COMMAND_LINE)
-    """Compression of a TIFF stack, zlib or lzma, as in ``write_stack``."""
 
 
 @options

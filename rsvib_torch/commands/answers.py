@@ -55,45 +55,31 @@ def stack_answer(frames: Path, found: detection.DetectionResult, pixel_size: flo
 
 
 def restoration_of(run: stacks.StackReport) -> tuple[list[str], Table]:
-    """What a run restored, as lines and as data, with warnings; of a single window with its verdict."""
+    """What a run restored, as lines and as data, with warnings; the lines of a single window have its verdict."""
     stored = stacks.read_manifest(run.manifest)
     if run.windows != 1 or run.first is None or run.first.restoration is None:
         warn_of_failures(stored)
         return [run.summary(), *stored.lines()[1][1:]], stored.totals()
-    result, record = run.first.restoration, stored.windows[0]
+    result, count = run.first.restoration, number_of(stored.windows[0].last + 1, "frame")
     verdict = result.verdict
     # 1. A warning if there is nothing to restore, or if restoration does not help or may not.
-    unchanged = "the frames are written unchanged"
+    nothing, unchanged = "no vibration was found that can be removed", "the frames are written unchanged"
     if not result.restored and verdict is None:
-        warn(f"no vibration was found that can be removed: {unchanged}")
+        warn(f"{nothing}: {unchanged}")
     elif verdict is not None and verdict.overall in ("partly", "worse"):
         warn(verdict.sentence + ("" if result.restored else f"; {unchanged}, --force writes the restored ones"))
     # 2. What was restored and its gain, and which axes were left unchanged and why.
-    count = number_of(record.last + 1, "frame")
     lines = [f"{count} unchanged"]
     if result.restored:
-        *most, last = result.restored_axes()
-        frames = count if len(result.frames) == record.last + 1 else f"1 image of {count}"
-        lines = [f"{frames} restored along {', '.join(most)}{' and ' * bool(most)}{last}"]
-    if verdict is not None:
-        lines.append(verdict.sentence)
-    elif result.restored:
-        lines.append("cannot determine whether restoration helps: no two frames show the same scene")
-    else:
-        lines.append("no vibration was found that can be removed")
+        frames = count if len(result.frames) == stored.windows[0].last + 1 else f"1 image of {count}"
+        lines = [f"{frames} restored along {' and '.join(result.restored_axes())}"]
+    unknown = "cannot determine whether restoration helps: no two frames show the same scene"
+    lines.append(verdict.sentence if verdict is not None else unknown if result.restored else nothing)
     for reason in result.left_alone:
         is_above = reason.code == "axis_not_reliable"  # its reasons were printed before
         text = f"{reason.axis} unchanged: its vibration is not reliable, see the reasons above"
         lines.append(text if is_above else str(reason))
-    data = {
-        "frames": record.frames,
-        "axes": result.restored_axes(),
-        "left_alone": [reason.to_dict() for reason in record.left_alone],
-        "outcome": record.outcome,
-        "predicted_gain_db": record.predicted_gain,
-        "summary": None if verdict is None else verdict.sentence,
-    }
-    return [wrapped(line) for line in lines] + stored.losses, data
+    return [wrapped(line) for line in lines] + stored.losses, stored.totals()
 
 
 def next_step(sentence: str, *command: object) -> str:
@@ -116,19 +102,17 @@ def steps_after_detection(
         restore = ("restore", frames, frames.with_name("restored.tif"), *settings.arguments, "--vibration", vibration)
         steps.append(next_step("restore the frames", *restore))
     reasons = [reason for of_axis in result.findings for reason in of_axis]
-    codes = {reason.code for reason in reasons}
+    other = {reason.code for reason in reasons if reason.code.startswith("other_")}
     run = ("run", frames, frames.with_name("results"), *settings.arguments)
-    if "other_frame_times" in codes:
+    if "other_frame_times" in other:
         steps.append(next_step("restore the frames with the times of those after the lost one", *run))
     # any motion explains frames with a wrong timing as well
-    elif any(reason.kind.free_model for reason in reasons) and not any(code.startswith("other_") for code in codes):
+    elif any(reason.kind.free_model for reason in reasons) and not other:
         if vibration is not None:  # a run in windows measures vibrations that change
             steps.append(next_step("measure a vibration that changes, and restore the frames", *run))
         motion = ("motion", frames, *settings.arguments, "--out", "motion.csv")
         steps.append(next_step("detect a motion that is not a steady vibration", *motion))
-    if reasons:
-        steps.append("follow the remedies that the reasons above name")
-    return steps
+    return [*steps, "follow the remedies that the reasons above name"] if reasons else steps
 
 
 # Files in a folder

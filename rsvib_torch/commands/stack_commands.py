@@ -116,9 +116,6 @@ class RestoreCommand(shared.RestoringCommand):
     """With a gyroscope: lens profile of Gyroflow (JSON)."""
     offset: float | None = option(None, show_default="for a gyroscope, estimated from the frames")
     """Required with --unit: time of the recording, in s, at the exposure start of the first row of frame 0."""
-    ignore: list[str] | None = option(None, metavar="ROWS[,COLUMNS]", show_default="all rows count")
-    """With a gyroscope: rows of the frames, or a part of them, that do not count in the comparison with it, for example
-    400: for a dashboard below row 400, or :60,500: for a sign in a corner; may be given several times."""
 
     @property
     def manifest(self) -> Path:
@@ -141,12 +138,11 @@ def restore(given: RestoreCommand) -> Answer:
     # 1. The vibration of all frames, or the motion on the clock of the frames.
     info, of_run = given.info, Table()
     if vibration is not None and given.motion is None:
-        of_recordings = ("offset", "unit", "ignore", "focal_length", "lens_profile")
-        if useless := [name for name in of_recordings if getattr(given, name) not in (None, ())]:
+        of_recordings = ("offset", "unit", "focal_length", "lens_profile")
+        if useless := [name for name in of_recordings if getattr(given, name) is not None]:
             option = useless[0].replace("_", "-")
             raise ValueError(f"--{option} is for --motion, a recording; --vibration is that of the frames themselves")
         detected = reports.read_vibration(vibration, io.timing_from_first_frame(settings.timing, info))
-        stacks.check_stack_fits(info, given.of_stack["restoration"], on_gpu=given.torch_device.type != "cpu")
         given.print_notes()
         of_run |= {"given": [detected], "window": max(2, info.shape[0])}
         answer = Answer({"Vibration": [detected.summary()]}, {"detection": answers.detection_data(detected)})
@@ -165,7 +161,6 @@ def restore(given: RestoreCommand) -> Answer:
 def _motion_of_frames(given: RestoreCommand, path: Path, info: StackInfo, answer: Answer) -> rsvib_torch.FreeMotion:
     """A recorded motion on the clock of the frames, which is stated or estimated."""
     recorded, timing = _recorded(given, path), given.settings.timing
-    ignore = stacks.mask_of_regions(given.ignore or (), (info.shape[-2], info.shape[-1]))
     given.print_notes()
     if isinstance(recorded, rsvib_torch.FreeMotion):
         if given.offset is None:
@@ -177,7 +172,7 @@ def _motion_of_frames(given: RestoreCommand, path: Path, info: StackInfo, answer
     elif given.focal_length is not None:
         camera = rsvib_torch.Camera(given.focal_length)
     with working("aligning the recording"):
-        found = stacks.align_stack(given.frames, info, timing, recorded, camera=camera, ignore=ignore)
+        found = stacks.align_stack(given.frames, info, timing, recorded, camera)
     answer.results["Recording on the clock of the frames"] = [found.summary()]
     answer.data["alignment"] = answers.without_curves(found)
     if found.reasons and not given.force:
@@ -190,9 +185,8 @@ def _motion_of_frames(given: RestoreCommand, path: Path, info: StackInfo, answer
 def _recorded(given: RestoreCommand, path: Path) -> rsvib_torch.FreeMotion | rsvib_torch.AngularRates:
     """The motion of a CSV file, or the rates of a gyroscope."""
     if given.unit is not None:
-        if given.lens_profile is not None or given.ignore:
-            name = "--ignore" if given.lens_profile is None else "--lens-profile"
-            raise ValueError(f"{name} is for a gyroscope, without --unit")
+        if given.lens_profile is not None:
+            raise ValueError("--lens-profile is for a gyroscope, without --unit")
         return rsvib_torch.read_motion(path, unit=given.unit, focal_length=given.focal_length)
     if given.offset is not None:
         raise ValueError("--offset needs --unit; axes and clock of a gyroscope are estimated from the frames")

@@ -41,15 +41,14 @@ def _find_dataset(file: File) -> Dataset:
     def visit(name: str, member: Group | Dataset) -> None:
         if next(members) > _MAX_MEMBERS:
             raise ValueError(f"it has more than {_MAX_MEMBERS} members; expected a file with one stack of frames")
-        if isinstance(member, h5py.Dataset) and member.ndim in (2, 3, 4) and member.dtype.kind in "iuf":
+        if isinstance(member, h5py.Dataset) and member.ndim in (3, 4) and member.dtype.kind in "iuf":
             found[name] = member
 
     file.visititems(visit)  # every member once, without links
-    stacks = {name: member for name, member in found.items() if member.ndim > 2 or name == _NAME} or found
-    if len(stacks) != 1 and _NAME not in stacks:
-        names = ", ".join(sorted(stacks)) or "none"
-        raise ValueError(f"expected one array of frames, or one called {_NAME!r}; found {names}")
-    dataset = stacks.get(_NAME, next(iter(stacks.values())))
+    if len(found) != 1 and _NAME not in found:
+        names = ", ".join(sorted(found)) or "none"
+        raise ValueError(f"expected one array of frames (T, H, W), or one called {_NAME!r}; found {names}")
+    dataset = found.get(_NAME, next(iter(found.values())))
     if dataset.external or dataset.is_virtual:
         raise ValueError(f"its dataset {dataset.name} lies in other files; frames must be in the file itself")
     return dataset
@@ -73,18 +72,16 @@ def open_hdf5(path: Path) -> FrameReader:
         # 2. Frames. HDF5 keeps decoded chunks of several frames until the last of their frames was read; one chunk
         # besides: measured with gzip, lzf, shuffle and without compression.
         count = math.prod(-(-size // side) for size, side in zip(shape[1:], sides[1:], strict=True))
-        kept = count * chunk if len(shape) > 2 and sides[0] > 1 else 0
+        kept = count * chunk if sides[0] > 1 else 0
         slots = min(100 * count + 421, 10**6)  # as HDF5 recommends
         dataset = opened.enter_context(h5py.File(path, "r", locking=False, rdcc_nbytes=kept, rdcc_nslots=slots))[name]
 
-        def read(index: int) -> Array:
-            return np.asarray(dataset[index] if len(shape) > 2 else dataset[...])
-
-        return FrameReader(path, replace(info, decoding_bytes=kept + chunk), read, opened.pop_all().close)
+        info = replace(info, decoding_bytes=kept + chunk)
+        return FrameReader(path, info, lambda index: np.asarray(dataset[index]), opened.pop_all().close)
 
 
-def write_hdf5(path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None) -> None:
-    """Write a file with a contiguous dataset, frame by frame; arguments as in ``StackFormat.write``.
+def write_hdf5(path: Path, info: StackInfo, frames: Iterator[Array]) -> None:
+    """Write a file with a contiguous dataset, frame by frame.
 
     HDF5 writes the header only: it ends the process if the disk is full when a file with pixels is closed.
     """
@@ -118,8 +115,8 @@ def open_npy(path: Path) -> FrameReader:
         return contiguous_reader(path, info, head.tell(), dtype)
 
 
-def write_npy(path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None) -> None:
-    """Write a file frame by frame, channels second; arguments as in ``StackFormat.write``."""
+def write_npy(path: Path, info: StackInfo, frames: Iterator[Array]) -> None:
+    """Write a file frame by frame, channels second."""
     header = {"descr": np.lib.format.dtype_to_descr(np.dtype(info.dtype)), "fortran_order": False, "shape": info.shape}
     with path.open("wb") as file:
         np.lib.format.write_array_header_1_0(file, header)

@@ -23,15 +23,14 @@ class StackFormat:
     name: str  # in messages
     endings: tuple[str, ...]  # lower case with the dot; ``""`` is a name without an ending
     open: Callable[[Path], FrameReader]
-    # ``write(path, info, frames, compression)``; None for formats that are only read
-    write: Callable[[Path, StackInfo, Iterator[Array], str | None], None] | None = None
+    # ``write(path, info, frames)``; None for formats that are only read
+    write: Callable[[Path, StackInfo, Iterator[Array]], None] | None = None
     dtypes: tuple[str, ...] = (  # NumPy names of those that can be written
         "uint8", "int8", "uint16", "int16", "uint32", "int32", "float16", "float32", "float64",
     )  # fmt: skip
     check: Callable[[Path, StackInfo], None] | None = None  # raises an error if a stack cannot be written to a path
-    uncompressed: bool = False  # whether files have the size of their pixels (without a value of ``compression``)
+    uncompressed: bool = False  # whether files have the size of their pixels
     kind: Kind = "file"  # a "folder" may contain other files
-    compressions: tuple[str, ...] = ()  # values of ``compression`` besides None
     keeps: tuple[str, ...] = ()  # attributes of ``StackInfo`` that are stored besides the pixels
 
 
@@ -49,15 +48,7 @@ _STACK_FORMATS = (
     StackFormat(
         "image folder", ("",), open_images, write_images, check=check_images, kind="folder", keeps=_KEPT_BY_PNG
     ),
-    StackFormat(
-        "tiff",
-        (".tif", ".tiff"),
-        open_tiff,
-        write_tiff,
-        uncompressed=True,
-        compressions=("zlib", "lzma"),
-        keeps=(*_KEPT, "metadata"),
-    ),
+    StackFormat("tiff", (".tif", ".tiff"), open_tiff, write_tiff, uncompressed=True, keeps=(*_KEPT, "metadata")),
     StackFormat("FFV1 video", FFV1, VideoReader, write_video, ("uint8", "uint16"), check_video, keeps=_KEPT),
     StackFormat("H.264 video", H264, VideoReader, write_video, check=check_video, keeps=_KEPT),
     StackFormat("avi, webm, mpeg, 3gp and wmv", READ_ONLY_VIDEO, VideoReader),

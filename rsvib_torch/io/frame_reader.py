@@ -27,8 +27,12 @@ class FrameReader:
 
     def frame(self, index: int) -> Array:
         """Pixels of a frame as stored: (H, W) or (C, H, W), in ``info.dtype``; ``FrameError`` if it is damaged."""
-        with readable_frame(self.path, index):
+        try:
             return np.ascontiguousarray(self._read(index), self.info.dtype)
+        except (MemoryError, FrameError, FileNotFoundError):
+            raise
+        except Exception as error:  # decoders raise errors of many types
+            raise FrameError(f"{self.path}: frame {index} cannot be read: {one_line(error)}") from error
 
     def close(self) -> None:
         """Close the file, if it is open between frames."""
@@ -105,14 +109,3 @@ def readable_stack(path: Path, kind: str) -> Iterator[None]:
         raise
     except Exception as error:
         raise ValueError(f"{path}: not a readable {kind} stack: {one_line(error)}") from error
-
-
-@contextmanager
-def readable_frame(path: Path, index: int) -> Iterator[None]:
-    """Convert any exception of a decoder into a one-line ``FrameError`` of frame ``index``."""
-    try:
-        yield
-    except (MemoryError, FrameError, FileNotFoundError):
-        raise
-    except Exception as error:
-        raise FrameError(f"{path}: frame {index} cannot be read: {one_line(error)}") from error

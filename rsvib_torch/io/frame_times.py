@@ -15,15 +15,7 @@ _RATE_TOLERANCE = 0.01  # relative; files state 30 for 29.97 frames per second (
 # independent, of 30 times 10 %
 _MIN_STAMPS = 50
 
-_ORIENTATIONS = {
-    2: "mirrored left to right",
-    3: "rotated by 180 degrees",
-    4: "mirrored top to bottom",
-    5: "rotated by 90 degrees clockwise and mirrored left to right",
-    6: "rotated by 90 degrees clockwise",
-    7: "rotated by 90 degrees anticlockwise and mirrored left to right",
-    8: "rotated by 90 degrees anticlockwise",
-}
+_TURNED = {3: "rotated by 180 degrees", 6: "rotated by 90 degrees clockwise", 8: "rotated by 90 degrees anticlockwise"}
 
 
 class _Spacing(NamedTuple):
@@ -97,10 +89,9 @@ def exposure_times(info: StackInfo, timing: SensorTiming) -> tuple[float, ...] |
     If a file without times states that frames are missing, the result consists of multiples of the sensor's frame
     period. Exact times are returned as they are. Times with an error, e.g. the presentation times of a video, are used
     only if their interval is the frame period of the sensor to 1 %, or their intervals include it. If they are whole
-    numbers of intervals apart to within their error or 2 % of a period, or a quarter of one with independent
-    deviations, the result consists of multiples of the sensor's frame period, with gaps where frames were dropped.
-    Otherwise the frame rate is variable: the times are
-    returned as they are if their error is less than a tenth of a period.
+    numbers of intervals apart (``_Spacing.numbers``), the result consists of multiples of the sensor's frame period,
+    with gaps where frames were dropped. Otherwise the frame rate is variable: the times are returned as they are if
+    their error is less than a tenth of a period.
     """
     if info.frame_times is None and info.frame_numbers is not None:
         return tuple(number * timing.frame_period for number in info.frame_numbers)
@@ -167,8 +158,8 @@ def timing_from_first_frame(timing: SensorTiming, info: StackInfo) -> SensorTimi
 def describe_stack(info: StackInfo, timing: SensorTiming | None) -> list[str]:
     """Sentences about an orientation, dropped frames and unequal intervals that a file states."""
     name, notes, missing, source = info.path or "the file", [], 0, f"its {info.time_source}"
-    if info.orientation in _ORIENTATIONS:
-        displayed = _ORIENTATIONS[info.orientation]
+    if info.orientation != 1:
+        displayed = _TURNED.get(info.orientation, "mirrored")
         notes.append(f"{name}: displayed {displayed}; rows, x and y are those of the stored frames")
     if timing is None or timing.frame_start_times is not None:
         return notes

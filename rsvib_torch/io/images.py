@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterator
 from contextlib import closing, suppress
 from dataclasses import replace
-from itertools import chain
+from itertools import chain, zip_longest
 from pathlib import Path
 
 import cv2
@@ -18,8 +18,8 @@ from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile, putchunk
 
 from rsvib_torch.frames.full_scale import known_full_scale
-from rsvib_torch.io.frame_reader import FrameError, FrameReader, check_held, readable_stack
-from rsvib_torch.io.stack_info import DIFFERENT, StackInfo, Tag, exif_fields
+from rsvib_torch.io.frame_reader import FrameReader, check_held, readable_stack
+from rsvib_torch.io.stack_info import DIFFERENT, StackInfo, Tag, exif_orientation
 from rsvib_torch.io.tiff import open_tiff, write_tiff
 from rsvib_torch.numerics.tables import Array
 
@@ -57,9 +57,10 @@ def _open_image(path: Path) -> FrameReader:
         if file_size > 4 * nbytes + _LONGEST_HEADER:
             raise ValueError(f"{file_size} bytes are too many for {size}")
         shape = (1, image.height, image.width) if channels == 1 else (1, channels, image.height, image.width)
+        orientation = exif_orientation(image.info.get("exif", b""))
         stated = image.info.get(_FULL_SCALE)
         full_scale = known_full_scale(dtype, None if stated is None else float(stated))
-        info = StackInfo(shape, dtype.name, full_scale, **exif_fields(image.info.get("exif", b"")))
+        info = StackInfo(shape, dtype.name, full_scale, orientation=orientation)
     return FrameReader(path, info, lambda _: _decoded(path, is_png))
 
 
@@ -76,7 +77,7 @@ def _decoded(path: Path, is_png: bool) -> Array:
     return stored if stored.ndim == 2 else np.moveaxis(stored[..., (2, 1, 0, 3)[: stored.shape[-1]]], -1, 0)
 
 
-def encode_png(path: Path, frame: Array, info: StackInfo) -> None:
+def _write_png(path: Path, frame: Array, info: StackInfo) -> None:
     """Write one frame (H, W) or (C, H, W), with full scale and orientation in chunks of their own."""
     if frame.ndim == 3:
         frame = np.moveaxis(frame, 0, -1)[..., (2, 1, 0, 3)[: frame.shape[0]] if frame.shape[0] > 1 else (0,)]
@@ -125,39 +126,37 @@ def _frame_numbers(files: list[Path]) -> tuple[int, ...] | None:
     Names must differ in one number, whose most common step is its smallest, and divides all steps: frame_0, frame_1,
     frame_3. Other names, e.g. with times in ms (frame_0, frame_33, frame_67), state nothing.
     """
-    names = [re.split(r"(\d+)", file.stem) for file in files]
-    if len(files) < 3 or any(len(name) != len(names[0]) or name[::2] != names[0][::2] for name in names):
+    parts = zip_longest(*(re.split(r"(\d+)", file.stem) for file in files))
+    varying = [texts for texts in parts if len(set(texts)) > 1]
+    if len(files) < 3 or len(varying) != 1 or not all((text or "").isdecimal() for text in varying[0]):
         return None
-    numbers = np.array([[int(part) for part in name[1::2]] for name in names], dtype=object)
-    varying = [column for column in numbers.T if len(set(column)) > 1]
-    if len(varying) != 1:
-        return None
-    steps = np.diff(varying[0])
+    numbers = np.array([int(text) for text in varying[0]], dtype=object)
+    steps = np.diff(numbers)
     step = min(steps)
     if step < 1 or np.median(steps.astype(float)) != step or any(steps % step) or all(steps == step):
         return None
-    return tuple(int(number - varying[0][0]) // step for number in varying[0])
+    return tuple(((numbers - numbers[0]) // step).tolist())
 
 
 def open_images(path: Path) -> FrameReader:
     """Open the files of a folder, or one file; frames are decoded on access."""
     files = _frame_files(path)
     infos: dict[Path, StackInfo] = {}
-    damaged: dict[Path, ValueError] = {}
+    damaged: list[ValueError] = []
     # 1. What each file states; all must be of one kind.
     for file in files:
         try:
             with closing(_open_image(file)) as reader:
                 infos[file] = info = replace(reader.info, frame_times=None)
         except ValueError as error:
-            damaged[file] = error
+            damaged.append(error)
             continue
         first, stack = next(iter(infos.items()))
         if info != stack:
             kinds = f"{first.name} is {stack.kind}, {file.name} is {info.kind}"
             raise ValueError(f"frames of different size or kind: {kinds}")
     if len(damaged) > len(files) // 2 or not infos:
-        raise next(iter(damaged.values()))
+        raise damaged[0]
     # 2. Metadata that are the same in all files.
     of_files = [info.metadata for info in infos.values()]
     metadata: dict[str, Tag | None] = {}
@@ -169,8 +168,6 @@ def open_images(path: Path) -> FrameReader:
         stack = replace(stack, files=tuple(files))
 
     def read(index: int) -> Array:
-        if files[index] in damaged:
-            raise FrameError(str(damaged[files[index]]))
         with closing(_open_image(files[index])) as reader:
             return reader.frame(0)
 
@@ -192,7 +189,7 @@ def _write_file(file: Path, info: StackInfo, frame: Array, source: Path | None =
     """Write one frame of a stack; a TIFF file keeps what that of the input, ``source``, states."""
     one = replace(info.with_frames(1), frame_times=None, frame_rate=None, metadata={})
     if file.suffix.lower() in _PNG:
-        encode_png(file, np.asarray(frame, dtype=info.dtype), one)
+        _write_png(file, np.asarray(frame, dtype=info.dtype), one)
         return
     with suppress(ValueError):  # a damaged file, whose frame is written as one without data
         if source is not None:
@@ -200,11 +197,11 @@ def _write_file(file: Path, info: StackInfo, frame: Array, source: Path | None =
                 like = reader.info
             times = None if like.time_error else like.frame_times
             one = replace(one, frame_times=times, metadata=like.with_shape(one.shape).metadata)
-    write_tiff(file, one, iter([frame]), None)
+    write_tiff(file, one, iter([frame]))
 
 
-def write_images(path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None) -> None:
-    """Write a PNG file of one frame, or a folder with one file per frame; arguments as in ``StackFormat.write``."""
+def write_images(path: Path, info: StackInfo, frames: Iterator[Array]) -> None:
+    """Write a PNG file of one frame, or a folder with one file per frame."""
     if path.suffix:
         _write_file(path, info, next(frames))
         return

@@ -31,15 +31,7 @@ _MAX_FRAMES = 10**7  # frames; reading that many frames of one pixel takes a min
 def open_stack(path: PathLike) -> FrameReader:
     """Open a stack to read its frames one at a time; call ``close`` on the result.
 
-    Args:
-        path: As in ``read_stack``.
-
-    Returns:
-        An object with ``info``, ``frame(index)`` and ``close()``.
-
-    Raises:
-        ModuleNotFoundError: If an optional package is missing, with the extra to install.
-        ValueError: If it is not a readable stack. Damage of single frames is detected when they are read.
+    ``path`` is as in ``read_stack``. Damage of single frames is detected when they are read.
 
     Example:
         >>> reader = open_stack("frames.tif")  # doctest: +SKIP
@@ -62,7 +54,7 @@ def open_stack(path: PathLike) -> FrameReader:
 def read_stack_info(path: PathLike) -> StackInfo:
     """Read what a file states about its stack: shape, data type and full scale, without its pixels.
 
-    Arguments and errors are those of ``open_stack``; unknown values are None.
+    ``path`` is as in ``read_stack``; unknown values are None.
 
     Example:
         >>> info = read_stack_info("frames.tif")  # doctest: +SKIP

@@ -1,6 +1,6 @@
 """Writing of stacks of frames, and checks of the file before frames are computed."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,8 +8,6 @@ import numpy as np
 import torch
 
 from rsvib_torch.checks.arguments import Channels, FramesLike, PathLike, as_tensor, channel_axis, checks_arguments
-from rsvib_torch.checks.values import check_choice
-from rsvib_torch.execution.progress import steps
 from rsvib_torch.files.atomic import check_outputs, check_target, whole
 from rsvib_torch.frames.full_scale import check_dtype, frames_to_counts, known_full_scale, required_full_scale
 from rsvib_torch.io.formats import FORMATS, StackFormat, target_format
@@ -23,18 +21,12 @@ def stack_files(path: PathLike) -> list[Path]:
     return [split_range(Path(path))[0]]
 
 
-def check_info_target(
-    path: Path, info: StackInfo, compression: str | None = None, *, parent_exists: bool = True
-) -> StackFormat:
+def check_info_target(path: Path, info: StackInfo, *, parent_exists: bool = True) -> StackFormat:
     """The format in which ``path`` is written, or the error of writing; ``parent_exists`` as in ``check_target``."""
     form = target_format(path)
     check_target(path, form.kind, parent_exists=parent_exists)
     if info.dtype not in form.dtypes:
         raise ValueError(f"{path}: {form.name} files hold {', '.join(form.dtypes)}; got dtype {info.dtype}")
-    if compression is not None:
-        if not form.compressions:
-            raise ValueError(f"{path}: compression={compression!r} is only available for TIFF files; omit it")
-        check_choice("compression", compression, form.compressions)
     if form.check is not None:
         form.check(path, info)
     if info.is_integer:
@@ -72,36 +64,24 @@ def metadata_not_kept(like: StackInfo, path: PathLike, shape: tuple[int, ...]) -
         >>> metadata_not_kept(info, "restored.tif", (8, 1024, 1024))
         ()
     """
-    form = target_format(Path(path))
-    # TIFF files like those of the input
-    in_files = form.kind == "folder" and like.with_frames(shape[0]).files is not None
+    form, kept = target_format(Path(path)), like.with_shape(shape)
+    in_files = form.kind == "folder" and kept.files is not None  # TIFF files like those of the input
     keeps = FORMATS[".tif"].keeps if in_files else form.keeps
     stated = like.full_scale not in (None, known_full_scale(np.dtype(like.dtype)))
-    timed = like.frame_times is not None and not like.time_error
-    lost = [name for name, tag in like.with_shape(shape).metadata.items() if tag is None or "metadata" not in keeps]
+    lost = [name for name, tag in kept.metadata.items() if tag is None or "metadata" not in keeps]
     if in_files and shape[-2:] == like.shape[-2:]:  # otherwise a georeference is lost
         lost = [name for name in lost if not name.endswith(DIFFERENT)]
-    others = {"full_scale": stated, "orientation": like.orientation != 1}
-    lost += [name.replace("_", " ") for name, has in others.items() if has and name not in keeps]
-    lost += ["frame times"] * (timed and not ("frame_times" in keeps and shape[0] == like.shape[0]))
-    return tuple(lost)
+    timed = like.frame_times is not None and not like.time_error
+    others = {"full_scale": stated, "orientation": like.orientation != 1, "frame_times": timed}
+    here = [name for name in keeps if getattr(kept, name) is not None]  # other numbers of frames have other times
+    return (*lost, *(name.replace("_", " ") for name, has in others.items() if has and name not in here))
 
 
-def write_frames(
-    form: StackFormat, path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None
-) -> None:
+def write_frames(form: StackFormat, path: Path, info: StackInfo, frames: Iterable[Array]) -> None:
     """Write a stack from its frames as stored; it gets its name when it is complete and on the disk."""
     assert form.write is not None
     with whole(path, form.kind, parent_exists=False) as part:
-        form.write(part, info, frames, compression)
-
-
-def _counted(pixels: Array) -> Iterator[Array]:
-    """The frames of a stack, with a report of the progress."""
-    advance = steps(len(pixels), "frames")
-    for frame in pixels:
-        yield frame
-        advance()
+        form.write(part, info, iter(frames))
 
 
 @checks_arguments
@@ -112,7 +92,6 @@ def write_stack(
     channels: Channels = None,
     dtype: str | None = None,
     full_scale: float | None = None,
-    compression: str | None = None,
     like: StackInfo | None = None,
 ) -> None:
     """Write a stack of frames: floats whose full scale is 1, or integer counts.
@@ -131,11 +110,9 @@ def write_stack(
         dtype: NumPy name of the data type in the file, by default ``"float32"``, and for integers their own.
         full_scale: Count that corresponds to 1.0; 255 for ``"uint8"`` if not given, required for other integers. Floats
             keep their values.
-        compression: ``"zlib"`` or ``"lzma"`` for TIFF files; None for no compression.
-        like: The stack from which the frames were computed: its resolution, orientation, frame rate, channel order,
-            metadata and, if the number of frames is the same, frame times are stored if the format supports them, and
-            NaN as its nodata value; ``metadata_not_kept`` lists those that are not. If both files are videos, the
-            presentation times of the frames and the audio are copied. Its file must not be ``path``.
+        like: The stack from which the frames were computed: its metadata, and of as many frames their times, are
+            stored as far as the format supports them (``metadata_not_kept``), and NaN as its nodata value. Between
+            videos, the presentation times of the frames and the audio are copied. Its file must not be ``path``.
 
     Raises:
         OSError: If the file cannot be written.
@@ -164,7 +141,7 @@ def write_stack(
     axis = channel_axis("frames", frames.shape, channels)
     frames = frames.movedim(axis, -3) if frames.ndim > 3 else frames
     info = _planned(tuple(frames.shape), dtype, full_scale, like)
-    form = check_info_target(path, info, compression)
+    form = check_info_target(path, info)
     nodata = None if like is None or dtype != like.dtype else like.nodata
     pixels = frames_to_counts(frames, np.dtype(info.dtype), info.full_scale, nodata)
-    write_frames(form, path, info, _counted(pixels), compression)
+    write_frames(form, path, info, pixels)

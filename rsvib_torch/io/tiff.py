@@ -245,8 +245,8 @@ def _value(page: tifffile.TiffPage, code: int) -> Any:
 # Writing
 
 
-def write_tiff(path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None) -> None:
-    """Write a TIFF file frame by frame; arguments as in ``StackFormat.write``."""
+def write_tiff(path: Path, info: StackInfo, frames: Iterator[Array]) -> None:
+    """Write a TIFF file frame by frame."""
     # Three or four channels are stored last (RGB), others as planes of a page.
     colour = info.axes == "TCHW" and info.shape[1] in (3, 4)
     axes = "TYX" if info.axes == "THW" else "TYXS" if colour else "TSYX" if info.shape[1] > 1 else "TCYX"
@@ -259,7 +259,7 @@ def write_tiff(path: Path, info: StackInfo, frames: Iterator[Array], compression
         value = tag.value.encode() if isinstance(tag.value, str) else tag.value
         if tag.code not in (_DESCRIPTION, *_RESOLUTION):
             extratags.append((tag.code, tag.dtype, tag.count, value, tag.first_page))
-    options: Table = {"compression": compression, "extratags": extratags}
+    options: Table = {"extratags": extratags}
     options["metadata"] = {**attributes_of(replace(info, orientation=1)), "axes": axes}
     options |= {"photometric": "rgb" if colour else "minisblack"} | ({"planarconfig": 2} if axes == "TSYX" else {})
     if _DESCRIPTION in tags:

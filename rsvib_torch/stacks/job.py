@@ -26,14 +26,13 @@ from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import (
     ProcessStackOptions,
     RestorationOptions,
-    StackDetectionOptions,
     StackOptions,
     VibrationOptions,
 )
 from rsvib_torch.restoration.restore import check_optics
 from rsvib_torch.stacks.memory import windows_at_once
 from rsvib_torch.stacks.window_restoration import (
-    known_motion,
+    WindowMotion,
     measured_motion,
     restore_trusted,
     usable_frame,
@@ -51,8 +50,7 @@ class StackJob:
     source: Path  # the stack
     info: StackInfo  # what its file states
     timing: SensorTiming  # timing of the whole stack
-    # with the full scale (None for floats) and the device that are used; ``restoration`` None is detection only
-    options: ProcessStackOptions
+    options: ProcessStackOptions  # with the full scale (None for floats) and the device that are used
     # of every window, the motion to use instead of a detection, from its first frame on; None: it has none
     given: Sequence[DetectedVibration | FreeMotion | None] | None = None
 
@@ -105,11 +103,9 @@ class StackJob:
                 given = self.given[window.index]
                 if given is None:
                     return replace(result, error="no detection was given for this window")
-                moved = known_motion(given, taken, timing, is_recorded=options.motion is not None)
+                moved = WindowMotion(given, given if isinstance(given, DetectedVibration) else None, timing)
             lost_before = None if moved.lost_before is None else window.first + moved.lost_before
             result = replace(result, detection=moved.tones, motion=moved.free, lost_before=lost_before)
-            if options.restoration is None:
-                return result
             # 3. The frames without it, and whether they are better.
             restoration = restore_trusted(
                 taken,
@@ -220,13 +216,10 @@ def _given(
     return [part.to(options.device) for part in parts]
 
 
-def plan_job(
-    source: PathLike, timing: SensorTiming, options: StackDetectionOptions
-) -> tuple[StackJob, list[Window], int]:
+def plan_job(source: PathLike, timing: SensorTiming, options: StackOptions) -> tuple[StackJob, list[Window], int]:
     """The job of a run, its windows, and how many of them to compute at once.
 
-    Frames are restored if the options are ``StackOptions``. The free memory limits the number of windows that are
-    computed at once, on this machine.
+    The free memory limits the number of windows that are computed at once, on this machine.
     """
     info = read_stack_info(source)
     full_scale = info.full_scale if options.full_scale is None else options.full_scale
@@ -238,8 +231,7 @@ def plan_job(
     check_choice("device", options.device.partition(":")[0], ("auto", "cpu", "cuda"))
     default = "cuda" if torch.cuda.is_available() else "cpu"
     device = default if options.device == "auto" else options.device
-    restoration = (options.restoration or {}) if isinstance(options, StackOptions) else None
-    of_job = {"full_scale": full_scale, "device": device, "restoration": restoration, "progress": None}
+    of_job = {"full_scale": full_scale, "device": device, "restoration": options.restoration or {}, "progress": None}
     stated = ProcessStackOptions(**{**vars(options), **of_job})
     windows = cut_windows(info.shape[0], stated.window)
     job = StackJob(Path(source), info, timing, stated, _given(stated, info, timing, windows))

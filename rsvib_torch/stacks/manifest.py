@@ -60,7 +60,7 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
     input: Table  # name, size and hash of the stack
     settings: Table  # sensor and options
     versions: Table  # of the packages that computed it
-    output: Table | None  # name of the output; None for detection only
+    output: str  # name of the output
     windows: tuple[WindowRecord, ...]
     not_kept: tuple[str, ...] = ()  # metadata of the input that the output does not contain
     margins: dict[str, int] | None = None  # px that were cut off the sides of the frames of a video
@@ -81,7 +81,7 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
     def summary(self) -> str:
         """Tones over the windows, what was restored, and what failed."""
         vibration, restoration = self.lines()
-        return "\n".join([*vibration, *(restoration if self.output is not None else self.losses)])
+        return "\n".join([*vibration, *restoration])
 
     def table(self, *, pixel_size: float | None = None) -> dict[str, list[object]]:
         """One row per tone, axis and window, as in ``DetectedVibration.table``; a failed window has one row.
@@ -120,7 +120,7 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
 
         Tones are medians over the reliable windows, with the standard deviation over the windows.
         """
-        windows, found = self.windows, self._tones
+        windows, found = self.windows, [record.detection for record in self.windows]
         gains = [record.predicted_gain for record in windows if record.predicted_gain is not None]
         names = AXIS_NAMES[: max((one.vibration.num_axes for one in found if one is not None), default=2)]
         unchanged = [(reason.axis, record.window, reason) for record in windows for reason in record.left_alone]
@@ -141,59 +141,34 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
     def lines(self) -> tuple[list[str], list[str]]:
         """The totals as lines of text: about the vibration, and about the restoration."""
         data = self.totals()
-        # All windows were measured, and nothing else than missing tones is stated against any axis.
-        is_still = bool(self.windows) and all(
-            one is not None and all(one.codes((axis,)) == "no_tone" for axis in range(one.vibration.num_axes))
-            for one in self._tones
-        )
-        vibration = self._tone_lines() if self.gyroscope is None else _gyroscope_lines(self.gyroscope)
-        if is_still:
-            text = "no window has a significant tone"
-            if "video" not in self.settings:  # a hand may move the camera of a video, which is measured without tones
-                text += ": the camera stands still, or moves uniformly or by less than the noise"
-            vibration.append(wrapped(text))
-        elif "video" in self.settings:
+        vibration = self._tone_lines(data["tones"]) if self.gyroscope is None else _gyroscope_lines(self.gyroscope)
+        if "video" in self.settings:
             vibration += self._lines_of_video()
         restoration = [f"{data['restored']} of {number_of(data['windows'], 'window')} restored"]
         if data["predicted_gain_db"] is not None:
             gains = dict.fromkeys(f"{gain:+.1f}" for gain in data["predicted_gain_db"].values())
             restoration.append(f"estimated improvement {' … '.join(gains)} dB")
-        for name, notes in data["left_alone"].items() if not is_still else ():
+        for name, notes in data["left_alone"].items():
             texts = {window: note["text"] for window, note in notes.items()}
             restoration += [wrapped(f"{name} unchanged in {text}") for text in _first_of(texts)]
         return vibration, restoration + self.losses
 
-    def _tone_lines(self) -> list[str]:
-        """A table of the tones of each axis over the windows, and what its columns mean.
-
-        If the vibration changes in windows, it has the amplitudes in the first and in the last one.
-        """
-        tones = {name: of_axis["tones"] for name, of_axis in self.totals()["tones"].items()}
-        rows, count, changing = [], len(self.windows), self._changing
+    def _tone_lines(self, tones: Table) -> list[str]:
+        """A table of the tones of each axis over the windows, and what its columns mean."""
+        rows, count = [], len(self.windows)
         for axis, of_axis in tones.items():
-            for tone in of_axis:
-                amplitude, frequency = (
-                    measured_text(tone[quantity], tone[f"{quantity}_spread"] or None)
-                    for quantity in ("amplitude", "frequency")
-                )
-                if changing and tone["windows"] > 1:
-                    amplitude = f"{tone['first']:.4g} … {tone['last']:.4g}"
-                rows.append([axis, f"{tone['windows']} of {count}", amplitude, frequency])
-            rows += [] if of_axis else [[axis, f"0 of {count}", "", ""]]
+            for tone in of_axis["tones"]:
+                quantities = ((tone[name], tone[f"{name}_spread"] or None) for name in ("amplitude", "frequency"))
+                rows.append([axis, f"{tone['windows']} of {count}", *(measured_text(*one) for one in quantities)])
+            rows += [] if of_axis["tones"] else [[axis, f"0 of {count}", "", ""]]
         lines = [text_table(["axis", "reliable windows", "amplitude (px)", "frequency (Hz)"], rows)]
-        if any(tones.values()):
-            spread = "median ± standard deviation over the windows"
-            lines.append(f"amplitude: in the first and the last window; frequency: {spread}" if changing else spread)
+        if any(of_axis["tones"] for of_axis in tones.values()):
+            lines.append("median ± standard deviation over the windows")
+        changing = sum(record.motion is not None for record in self.windows)
         if changing:
             which = "all" if changing == count else f"{changing} of {count}"
             measured = f"no steady tones explain {which} windows, whose motion was therefore measured without tones"
             lines.append(wrapped(f"{measured}; amplitudes are those of a tone of the same rms displacement"))
-            refused: dict[object, str] = {
-                record.window: "; ".join(map(str, record.detection.assumptions))
-                for record in self.windows
-                if record.detection is not None and record.motion is not None and record.detection.assumptions
-            }
-            lines += [wrapped(f"assumed in {note}") for note in _first_of(refused)]
         return lines
 
     @property
@@ -209,36 +184,19 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
 
     def _lines_of_video(self) -> list[str]:
         """Axes of a video that were restored although they are not reliable, and the first assumption."""
-        of_text: dict[str, list[str]] = {}  # the axes against which the same is stated
+        found = [(record.window, record.detection) for record in self.windows if record.detection is not None]
+        lines = []
         for axis, name in enumerate(AXIS_NAMES[:2]):
-            against = {
-                record.window: "; ".join(str(one) for one in record.detection.findings[axis] if one.code != "no_tone")
-                for record in self.windows
-                if record.detection is not None
-            }
-            for text in _first_of({window: why for window, why in against.items() if why}):
-                of_text.setdefault(text, []).append(name)
-        lines = [
-            f"{' and '.join(names)} restored as measured, but not reliable in {windows}"
-            for windows, names in of_text.items()
-        ]
-        assumed = [str(one) for found in self._tones if found is not None for one in found.assumptions]
-        return [wrapped(line) for line in (*lines, *(f"assumed: {one}" for one in assumed[:1]))]
+            against = {window: [one for one in of.findings[axis] if one.code != "no_tone"] for window, of in found}
+            texts = _first_of({window: "; ".join(map(str, why)) for window, why in against.items() if why})
+            lines += [f"{name} restored as measured, but not reliable in {text}" for text in texts]
+        lines += [f"assumed: {one}" for _, of in found for one in of.assumptions][:1]
+        return [wrapped(line) for line in lines]
 
     @property
     def is_removed(self) -> bool:
         """Whether another motion than a steady vibration was removed: that of a video, or one that changes."""
-        return "video" in self.settings or self._changing > 0
-
-    @property
-    def _changing(self) -> int:
-        """Number of windows in which the vibration changes."""
-        return sum(record.motion is not None for record in self.windows)
-
-    @property
-    def _tones(self) -> list[DetectedVibration | None]:
-        """The tones of every window; None where the detection failed."""
-        return [record.detection for record in self.windows]
+        return "video" in self.settings or any(record.motion is not None for record in self.windows)
 
     def detections(self) -> list[DetectedVibration | FreeMotion | None]:
         """The detection of every window, or its motion if the vibration changes; None where it failed.
@@ -288,7 +246,7 @@ def _tones_over_windows(found: Sequence[DetectedVibration | None], axis: int) ->
                 tones.append([(amplitude, frequency)])
     described: list[Table] = []
     for tone in tones:
-        described.append({"windows": len(tone), "first": tone[0][0], "last": tone[-1][0]})
+        described.append({"windows": len(tone)})
         for name, values in zip(("amplitude", "frequency"), zip(*tone, strict=True), strict=True):
             described[-1] |= {name: median(values), f"{name}_spread": stdev(values) if len(values) > 1 else None}
     return {"reliable_windows": len(reliable), "tones": sorted(described, key=lambda tone: -tone["amplitude"])}
@@ -318,7 +276,7 @@ def fingerprint(path: Path) -> Table:
 _SETTINGS = tuple(name for name in fields_of(StackOptions) if name not in ("memory", "workers"))
 
 
-def manifest_header(job: StackJob, output: str | None, compression: str | None) -> Table:
+def manifest_header(job: StackJob, output: str) -> Table:
     """Everything on which the result depends, for JSON: a run is resumed only if it is unchanged."""
     given = None
     if job.given is not None:
@@ -330,7 +288,7 @@ def manifest_header(job: StackJob, output: str | None, compression: str | None) 
         "input": {**fingerprint(job.source), "shape": list(job.info.shape), "dtype": job.info.dtype},
         "settings": {"sensor": job.timing.to_dict(), "given": given, **options},
         "versions": {name: version(name) for name in ("rsvib_torch", "torch", "numpy")},
-        "output": None if output is None else {"name": output, "compression": compression},
+        "output": output,
     }
 
 

@@ -103,9 +103,9 @@ def windows_at_once(info: StackInfo, options: ProcessStackOptions) -> int:
     return int(min(workers, count))
 
 
-def check_stack_fits(info: StackInfo, restoration: OptionTable = None, *, on_gpu: bool = False) -> None:
-    """Raise a ``ValueError`` if a stack that is processed as a whole does not fit into the free memory."""
+def check_stack_fits(info: StackInfo, *, on_gpu: bool) -> None:
+    """Raise a ``ValueError`` if a stack that is detected as a whole does not fit into the free memory."""
     what = f"{info.path or 'the frames'}: {info.shape[0]} frames of {info.shape[-2]} x {info.shape[-1]} px"
-    needed = memory_needed(info, info.shape[0], restoration, on_gpu=on_gpu) - psutil.Process().memory_info().rss
+    needed = memory_needed(info, info.shape[0], None, on_gpu=on_gpu) - psutil.Process().memory_info().rss
     remedy = "process them in windows (rsvib run)"
     check_fits(f"{what}, processed together,", needed, remedy)

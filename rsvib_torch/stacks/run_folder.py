@@ -275,11 +275,9 @@ class StackReport(Summarised):
             lines[0] += f", {self.seconds / self.frames:.2g} s per frame"
         if self.resumed:
             lines.append(f"windows complete before this run: {self.resumed}")
-        see = f"see {self.manifest.name}"
-        if self.failed:
-            lines.append(f"detection or restoration failed in {number_of(self.failed, 'window')}: {see}")
-        if self.bad_frames:
-            lines.append(f"{number_of(self.bad_frames, 'frame')} could not be used: {see}")
+        if self.failed or self.bad_frames:
+            unusable = f"{number_of(self.bad_frames, 'frame')} could not be used"
+            lines.append(f"{number_of(self.failed, 'window')} failed, {unusable}: see {self.manifest.name}")
         return "\n".join(lines)
 
 

@@ -6,7 +6,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import math
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -65,7 +65,7 @@ class WindowMotion:
     """How the frames of a window move, and when they were taken."""
 
     motion: DetectedVibration | MotionDetection | FreeMotion  # what ``restore_trusted`` undoes
-    tones: DetectedVibration | None  # the vibration, or tones in its place; None of a recorded motion
+    tones: DetectedVibration | None  # the vibration, or tones in its place; None of a motion that was given
     timing: SensorTiming  # of the frames
     free: FreeMotion | None = None  # that of a vibration that changes, whose axes rest that are not reliable
     lost_before: int | None = None  # the first frame of the window after a lost one; its later time is in ``timing``
@@ -89,23 +89,8 @@ def measured_motion(frames: Tensor, timing: SensorTiming, options: Mapping[str, 
     with suppress(ValueError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
         found = detect_motion(frames, timing, knot_rows=min(24, max(4, rows // _KNOTS)))
         if found.reliable.sum() > detected.reliable.sum():
-            return WindowMotion(found, _tones_of_detected(found, detected), timing, reliable_motion(found)[0])
+            return WindowMotion(found, _tones_in_place_of(found, detected), timing, reliable_motion(found)[0])
     return WindowMotion(detected, detected, timing)
-
-
-def known_motion(
-    given: DetectedVibration | FreeMotion, frames: Tensor, timing: SensorTiming, *, is_recorded: bool
-) -> WindowMotion:
-    """A motion that is given for the frames of a window: recorded, or measured in an earlier run."""
-    if isinstance(given, DetectedVibration):
-        return WindowMotion(given, given, timing)
-    if is_recorded:
-        return WindowMotion(given, None, timing)
-    starts, rows = timing.frame_starts(len(frames)), frames.shape[int(timing.scan_axis)]
-    last = float(starts[-1]) + (rows - 1) * timing.row_time + timing.exposure_time
-    unknown = torch.full((given.num_axes,), math.inf, dtype=torch.float64, device=given.coefficients.device)
-    tones = _tones_in_place_of(given, float(starts[0]), last, unknown, float(starts.diff().mean()))
-    return WindowMotion(given, tones, timing, given)
 
 
 def may_change(detection: DetectedVibration, num_frames: int) -> bool:
@@ -132,47 +117,32 @@ def reliable_motion(found: MotionDetection) -> tuple[FreeMotion, tuple[Reason, .
     return kept, tuple(refused)
 
 
-def _tones_of_detected(found: MotionDetection, refused: DetectedVibration) -> DetectedVibration:
-    """Tones in place of a detected motion, with the reasons against those that were refused as assumptions.
+def _tones_in_place_of(found: MotionDetection, refused: DetectedVibration) -> DetectedVibration:
+    """A tone for each axis of a detected motion, to draw it and list it beside the tones of other windows.
 
-    A wrong timing and lost frames have the same reasons as a vibration that changes.
+    The standard deviation of the frequency is half of the resolution of the record. The reasons against the ``refused``
+    tones are assumptions, because a wrong timing and lost frames have the same reasons as a vibration that changes.
     """
     against = zip(AXIS_NAMES, refused.findings, strict=False)
     assumed = tuple(
         f"the vibration changes; tones along {name} are refused: {one}" for name, of in against for one in of
     )
     first, last = float(found.times.min()), float(found.times.max())
-    std, interval = found.std.square().mean((0, 1)).sqrt(), float(found.times[:, 0].diff().mean())
-    tones = _tones_in_place_of(found.motion, first, last, std, interval)
-    return replace(
-        tones, residual=found.unexplained, reliable=found.reliable, findings=found.findings, assumptions=assumed
-    )
-
-
-def _tones_in_place_of(
-    motion: FreeMotion, first: float, last: float, displacement: Tensor, interval: float
-) -> DetectedVibration:
-    """A tone for each axis of a motion of any shape, to draw it and list it beside the tones of other windows.
-
-    The standard deviation of the frequency is half of the resolution of the record, which is that from ``first`` to
-    ``last`` (s) with frames every ``interval``; ``displacement`` (A,) is the standard deviation of the motion.
-    """
-    vibration = vibration_in_place_of(motion, first, last)
-    amplitude, frequency = vibration.amplitude, vibration.frequency
-    unknown = torch.full_like(amplitude, math.inf)
-    by_frequency = torch.full_like(amplitude, 0.5 / (last - first))
+    displacement = found.std.square().mean((0, 1)).sqrt()
+    vibration = vibration_in_place_of(found.motion, first, last)
+    unknown = torch.full_like(vibration.amplitude, math.inf)
+    by_frequency = torch.full_like(vibration.amplitude, 0.5 / (last - first))
     std = VibrationStd(
         amplitude=math.sqrt(2) * displacement[:, None],
         frequency=by_frequency,
         phase=unknown,
-        period=by_frequency / frequency.square().clamp(min=1e-300),
+        period=by_frequency / vibration.frequency.square().clamp(min=1e-300),
         image_motion=math.sqrt(12) * displacement / (last - first),
         image_acceleration=unknown[:, 0],
         displacement=displacement,
     )
-    moves = motion.moving_axes()
-    none, findings = torch.zeros_like(displacement), tuple(() for _ in moves)
-    return DetectedVibration(vibration, std, vibration.gain(interval), none, moves, findings, assumptions=())
+    gain = vibration.gain(float(found.times[:, 0].diff().mean()))
+    return DetectedVibration(vibration, std, gain, found.unexplained, found.reliable, found.findings, assumed)
 
 
 # --- Restoration and verdict ---

@@ -98,7 +98,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
     content = job.content(job.info, timing)
     if border != "crop":
         check_info_target(sink, content, parent_exists=False)
-    header = manifest_header(job, sink.name, None)
+    header = manifest_header(job, sink.name)
     header["settings"] |= {
         "window": None,  # for the commands that read manifests: parts are not windows of their own
         "video": {

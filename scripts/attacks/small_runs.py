@@ -22,14 +22,13 @@ from attacks.files import DETECTION, FULL_SCALE, vibrating_counts, write_tiff
 from attacks.trial import Trial
 
 import rsvib_torch as rsv
-from rsvib_torch.stacks import detect_stack, read_manifest
+from rsvib_torch.stacks import read_manifest
 
 FRAMES, SIZE, WINDOW = 13, 64, 3
 TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=72)
 WINDOWS = 6
 FORMATS: dict[str, tuple[str, dict[str, Any]]] = {
     "TIFF": ("out.tif", {}),
-    "TIFF, zlib": ("packed.tif", {"compression": "zlib"}),
     "npy": ("out.npy", {}),
     "HDF5": ("out.h5", {}),
     "PNG folder": ("frames", {}),
@@ -62,9 +61,10 @@ def server() -> Any:
 def process(source: Path, sink: Path, **options: Any) -> Any:
     """Restore the small stack with known vibrations, so that a run takes a fraction of a second."""
     torch.set_num_threads(1)
-    given = read_manifest(source.with_name("vibrations.json")).detections()
     common = {"window": WINDOW, "restoration": {"method": "dewarp"}, "full_scale": FULL_SCALE, "workers": 1}
-    return rsv.process_stack(source, sink, TIMING, **common | {"given": given} | options)
+    if "given" not in options:
+        common["given"] = read_manifest(source.with_name("vibrations.json")).detections()
+    return rsv.process_stack(source, sink, TIMING, **common | options)
 
 
 def _prepare(folder: Path) -> None:
@@ -72,8 +72,8 @@ def _prepare(folder: Path) -> None:
     torch.set_num_threads(1)
     source = folder / "frames.tif"
     write_tiff(source, vibrating_counts(TIMING, FRAMES, (SIZE, SIZE), seed=2))
-    detection = {"window": WINDOW, "detection": DETECTION, "full_scale": FULL_SCALE}
-    detect_stack(source, folder / "vibrations.json", TIMING, **detection)
+    manifest = folder / "vibrations.json"
+    process(source, folder / "first.npy", given=None, detection=DETECTION, manifest=manifest)
     for name, options in FORMATS.values():
         report = process(source, folder / "whole" / name, **options)
         assert (report.frames, report.windows) == (FRAMES, WINDOWS)

@@ -88,7 +88,7 @@ def test_a_wrong_vibration_leaves_the_frames_unchanged_unless_forced(place, vibr
     shown = capsys.readouterr()
     assert "restored is no better than raw" in shown.err
     restoration = json.loads(shown.out)["restoration"]
-    assert (restoration["frames"], restoration["outcome"]) == ("restored", "worse")
+    assert (restoration["restored"], restoration["outcomes"]) == (1, {"worse": 1})
     assert (tifffile.imread(tmp_path / "r.tif") != tifffile.imread(place / "frames.tif")).any()
 
 

@@ -110,13 +110,12 @@ def test_marked_options_of_process_stack_are_those_of_run_and_restore(place, tmp
     """And a run is resumed only with the same values of those on which its result may depend."""
     fields = fields_of(ProcessStackOptions)
     marked = {f"--{name}" for name, field in fields.items() if field.json_schema_extra == COMMAND_LINE}
-    assert marked == {"--memory", "--workers", "--window", "--resume", "--compression"}
+    assert marked == {"--memory", "--workers", "--window", "--resume"}
     for name in ("run", "restore"):
         assert rsvib(name, "--help") == 0
         assert marked <= set(capsys.readouterr().out.split())
-    assert rsvib(*command(place, "run", tmp_path / "out"), "--compression", "zlib", "--workers", 1) == 0
+    assert rsvib(*command(place, "run", tmp_path / "out"), "--workers", 1) == 0
     manifest = read_manifest(tmp_path / "out" / "manifest.json")
-    assert manifest.output["compression"] == "zlib"
     assert manifest.settings.keys() == {"sensor", "given", *fields_of(StackOptions)} - {"memory", "workers"}
 
 

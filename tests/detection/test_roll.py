@@ -227,6 +227,6 @@ def test_commands_write_the_results_of_a_rolling_camera(rolling, tmp_path, capsy
     answer = json.loads(capsys.readouterr().out)
     assert answer["detection"]["reliable"] == [True, True, True]
     assert answer["detection"]["vibration"]["amplitude"][2][0] == pytest.approx(2.5e-3, rel=0.03)
-    assert answer["restoration"]["axes"] == ["x", "y", "roll"]
+    assert answer["restoration"]["left_alone"] == {"x": {}, "y": {}, "roll": {}}
     assert (tmp_path / "page" / "offsets.png").exists()
     assert "roll: reliable" in (tmp_path / "page" / "report.html").read_text()

@@ -6,11 +6,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from small_stack import TIMING, process_small, write_small
+from small_stack import process_small, write_small
 
 import rsvib_torch as rsv
 from rsvib_torch.files.atomic import check_outputs
-from rsvib_torch.stacks.process import detect_stack
 
 
 @pytest.fixture(name="place")
@@ -91,7 +90,6 @@ def test_pipes_are_not_replaced(tmp_path, name, linked):
         lambda: process_small(source, output, resume=True),
         lambda: process_small(source, tmp_path / "new.tif", manifest=output),
         lambda: rsv.write_stack(output, torch.rand(2, 8, 8)),
-        lambda: detect_stack(source, output, TIMING, full_scale=4095),
     ):
         with pytest.raises(OSError, match="device, pipe or socket; choose another name") as raised:
             write()

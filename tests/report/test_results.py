@@ -177,7 +177,7 @@ def test_comparison_draws_the_same_crop_of_both_frames(tmp_path, shape):
 WINDOW = {"window": 0, "first": 0, "last": 3, "start_time": 0.0, "written": 4, "frames": "as taken", "left_alone": []}
 WINDOW |= dict.fromkeys(("detection", "outcome", "predicted_gain"))
 WINDOW |= {"error": "all pixels of frame 2 are equal", "bad_frames": {"2": "all pixels are equal"}}
-MANIFEST = {"format": "rsvib stack", "version": 1, "output": None, "windows": [WINDOW, WINDOW | {"window": 1}]}
+MANIFEST = {"format": "rsvib stack", "version": 1, "output": "a.tif", "windows": [WINDOW, WINDOW | {"window": 1}]}
 MANIFEST |= {name: {} for name in ("input", "settings", "versions")}
 
 

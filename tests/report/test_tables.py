@@ -27,7 +27,7 @@ def window(number, vibration, **options):
 
 def manifest_of(*windows):
     settings = {"sensor": TIMING.to_dict()}
-    return StackManifest({"shape": [40, 300, 400]}, settings, {}, None, windows)
+    return StackManifest({"shape": [40, 300, 400]}, settings, {}, "restored.tif", windows)
 
 
 def test_one_row_per_tone_without_padding(tmp_path):

@@ -13,7 +13,7 @@ from small_stack import stop_after
 from truth import Curve, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
-from rsvib_torch.stacks import detect_stack, read_manifest
+from rsvib_torch.stacks import read_manifest
 
 TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=12, frame_rows=500)
 CAMERA = ["--row-time", "100us", "--exposure", "1.2ms", "--frame-rate", "20"]
@@ -61,7 +61,7 @@ def test_windows_state_equivalent_tones_and_their_motion(place):
     assert all(table["reliable"])
     assert all(table["equivalent"])
     assert all("tones along" in str(one) for record in manifest.windows for one in record.detection.assumptions)
-    assert "the vibration changes; tones along x are refused: " in " ".join(manifest.summary().split())
+    assert "no steady tones explain all windows" in " ".join(manifest.summary().split())
     envelope = np.exp(-np.array(table["middle_time_s"]) / DECAY)
     windows = len(manifest.windows)
     np.testing.assert_allclose(table["amplitude_px"], np.tile(AMPLITUDE, windows) * envelope, rtol=0.1)
@@ -79,10 +79,6 @@ def test_the_motions_of_a_manifest_restore_the_same_frames(place, tmp_path):
     given = read_manifest(place / "out.npy.manifest.json").detections()
     process(place, tmp_path / "out.npy", given=given)
     np.testing.assert_array_equal(np.load(tmp_path / "out.npy"), np.load(place / "out.npy"))
-    first, again = (read_manifest(f"{path}/out.npy.manifest.json").totals()["tones"] for path in (place, tmp_path))
-    for name in "xy":
-        assert again[name]["reliable_windows"] == first[name]["reliable_windows"]
-        assert again[name]["tones"][0]["amplitude"] == pytest.approx(first[name]["tones"][0]["amplitude"], rel=0.05)
 
 
 def test_detect_names_the_command_that_measures_a_vibration_that_changes(place, tmp_path, capsys):
@@ -152,12 +148,6 @@ def test_bad_frames_are_written_as_taken_and_the_others_restored(place, tmp_path
     restored = np.load(tmp_path / "out.npy")
     np.testing.assert_array_equal(restored[7], frames[7])
     assert min(decibel(restored[index], STILL) for index in (6, 8, 9)) > 36
-
-
-def test_windows_that_are_only_detected_state_their_motion(place, tmp_path):
-    detect_stack(place / "frames.npy[0:8]", tmp_path / "manifest.json", TIMING)
-    (record,) = read_manifest(tmp_path / "manifest.json").windows
-    assert (record.written, record.motion is not None) == (0, True)
 
 
 def test_run_restores_a_vibration_that_changes_without_an_option(place, tmp_path, capsys):
