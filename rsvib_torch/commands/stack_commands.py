@@ -116,6 +116,9 @@ class RestoreCommand(shared.RestoringCommand):
     """With a gyroscope: lens profile of Gyroflow (JSON)."""
     offset: float | None = option(None, show_default="for a gyroscope, estimated from the frames")
     """Required with --unit: time of the recording, in s, at the exposure start of the first row of frame 0."""
+    ignore: list[str] | None = option(None, metavar="ROWS[,COLUMNS]", show_default="all rows count")
+    """With a gyroscope: rows of the frames, or a part of them, that do not count in the comparison with it, for example
+    400: for a dashboard below row 400, or :60,500: for a sign in a corner; may be given several times."""
 
     @property
     def manifest(self) -> Path:
@@ -138,8 +141,8 @@ def restore(given: RestoreCommand) -> Answer:
     # 1. The vibration of all frames, or the motion on the clock of the frames.
     info, of_run = given.info, Table()
     if vibration is not None and given.motion is None:
-        of_recordings = ("offset", "unit", "focal_length", "lens_profile")
-        if useless := [name for name in of_recordings if getattr(given, name) is not None]:
+        of_recordings = ("offset", "unit", "ignore", "focal_length", "lens_profile")
+        if useless := [name for name in of_recordings if getattr(given, name) not in (None, ())]:
             option = useless[0].replace("_", "-")
             raise ValueError(f"--{option} is for --motion, a recording; --vibration is that of the frames themselves")
         detected = reports.read_vibration(vibration, io.timing_from_first_frame(settings.timing, info))
@@ -161,6 +164,7 @@ def restore(given: RestoreCommand) -> Answer:
 def _motion_of_frames(given: RestoreCommand, path: Path, info: StackInfo, answer: Answer) -> rsvib_torch.FreeMotion:
     """A recorded motion on the clock of the frames, which is stated or estimated."""
     recorded, timing = _recorded(given, path), given.settings.timing
+    ignore = stacks.mask_of_regions(given.ignore or (), (info.shape[-2], info.shape[-1]))
     given.print_notes()
     if isinstance(recorded, rsvib_torch.FreeMotion):
         if given.offset is None:
@@ -172,7 +176,7 @@ def _motion_of_frames(given: RestoreCommand, path: Path, info: StackInfo, answer
     elif given.focal_length is not None:
         camera = rsvib_torch.Camera(given.focal_length)
     with working("aligning the recording"):
-        found = stacks.align_stack(given.frames, info, timing, recorded, camera)
+        found = stacks.align_stack(given.frames, info, timing, recorded, camera=camera, ignore=ignore)
     answer.results["Recording on the clock of the frames"] = [found.summary()]
     answer.data["alignment"] = answers.without_curves(found)
     if found.reasons and not given.force:
@@ -185,8 +189,9 @@ def _motion_of_frames(given: RestoreCommand, path: Path, info: StackInfo, answer
 def _recorded(given: RestoreCommand, path: Path) -> rsvib_torch.FreeMotion | rsvib_torch.AngularRates:
     """The motion of a CSV file, or the rates of a gyroscope."""
     if given.unit is not None:
-        if given.lens_profile is not None:
-            raise ValueError("--lens-profile is for a gyroscope, without --unit")
+        if given.lens_profile is not None or given.ignore:
+            name = "--ignore" if given.lens_profile is None else "--lens-profile"
+            raise ValueError(f"{name} is for a gyroscope, without --unit")
         return rsvib_torch.read_motion(path, unit=given.unit, focal_length=given.focal_length)
     if given.offset is not None:
         raise ValueError("--offset needs --unit; axes and clock of a gyroscope are estimated from the frames")

@@ -19,7 +19,7 @@ from PIL.PngImagePlugin import PngImageFile, putchunk
 
 from rsvib_torch.frames.full_scale import known_full_scale
 from rsvib_torch.io.frame_reader import FrameReader, check_held, readable_stack
-from rsvib_torch.io.stack_info import DIFFERENT, StackInfo, Tag, exif_orientation
+from rsvib_torch.io.stack_info import DIFFERENT, StackInfo, Tag, exif_fields
 from rsvib_torch.io.tiff import open_tiff, write_tiff
 from rsvib_torch.numerics.tables import Array
 
@@ -57,10 +57,9 @@ def _open_image(path: Path) -> FrameReader:
         if file_size > 4 * nbytes + _LONGEST_HEADER:
             raise ValueError(f"{file_size} bytes are too many for {size}")
         shape = (1, image.height, image.width) if channels == 1 else (1, channels, image.height, image.width)
-        orientation = exif_orientation(image.info.get("exif", b""))
         stated = image.info.get(_FULL_SCALE)
         full_scale = known_full_scale(dtype, None if stated is None else float(stated))
-        info = StackInfo(shape, dtype.name, full_scale, orientation=orientation)
+        info = StackInfo(shape, dtype.name, full_scale, **exif_fields(image.info.get("exif", b"")))
     return FrameReader(path, info, lambda _: _decoded(path, is_png))
 
 

@@ -15,6 +15,7 @@ from rsvib_torch.checks.arguments import channels_appear_last, check_fields, che
 from rsvib_torch.files.reading import Table
 from rsvib_torch.frames.full_scale import check_dtype, known_full_scale
 from rsvib_torch.results.presentation import Summarised
+from rsvib_torch.text import one_line
 
 # Endings of videos: of those that are written with H.264 and FFV1, and of those that are only read.
 H264, FFV1 = (".mp4", ".mov", ".m4v"), (".mkv",)
@@ -62,7 +63,7 @@ class StackInfo(Summarised):
             that cannot be kept.
         decoding_bytes: Memory that reading needs besides the frame that is returned: frames that are stored together
             are decoded together.
-        camera: Make and model of the camera, if the tags of a video state them.
+        camera: Make and model of the camera, if the file states them (EXIF of JPEG and PNG, tags of videos).
         files: The file of each frame, of a folder of TIFF files. Frames that are restored to a folder get their names,
             metadata.
 
@@ -184,6 +185,13 @@ def orientation_of(value: object) -> int:
     return int(value) if isinstance(value, int | np.integer) and value in range(1, 9) else 1
 
 
+def camera_name(make: object, model: object) -> str | None:
+    """Make and model of a camera as one name, with the make once (Canon, Canon EOS R5); None without a model."""
+    maker, name = (one_line("" if text is None else str(text).replace("\0", " "), 60) for text in (make, model))
+    repeated = name.casefold().startswith(maker.casefold())
+    return None if not name else name if repeated else f"{maker} {name}"
+
+
 def attributes_of(info: StackInfo) -> Table:
     """Attributes of an array in a file, or keys of a TIFF description, that state ``info``, without unknown values."""
     times = info.frame_times
@@ -225,11 +233,13 @@ def check_array(path: Path, info: StackInfo) -> None:
         raise ValueError(f"{path}: array of shape {info.shape} would be read as one with channels last; write .tif")
 
 
-def exif_orientation(data: bytes) -> int:
-    """Orientation of one image from its EXIF metadata."""
+def exif_fields(data: bytes) -> Table:
+    """Orientation and camera of one image from its EXIF metadata."""
     exif = Image.Exif()
     try:
         exif.load(data)
     except Exception:  # damaged metadata raise errors of many types
-        return 1
-    return orientation_of(exif.get(ExifTags.Base.Orientation))
+        return {}
+    tags = ExifTags.Base
+    camera = camera_name(exif.get(tags.Make), exif.get(tags.Model))
+    return {"orientation": orientation_of(exif.get(tags.Orientation)), "camera": camera}

@@ -22,9 +22,8 @@ import numpy as np
 from rsvib_torch.checks.values import needed_package
 from rsvib_torch.files.reading import check_fits
 from rsvib_torch.io.frame_reader import FrameError, FrameReader, readable_stack
-from rsvib_torch.io.stack_info import H264, VIDEO, StackInfo
+from rsvib_torch.io.stack_info import H264, VIDEO, StackInfo, camera_name
 from rsvib_torch.numerics.tables import Array
-from rsvib_torch.text import one_line
 
 if TYPE_CHECKING:
     import av
@@ -148,14 +147,11 @@ def _listed_times(container: InputContainer, stream: av.VideoStream) -> list[Fra
 
 
 def _camera(tags: dict[str, str]) -> str | None:
-    """Make and model of the camera (the make once) in the tags of a video: QuickTime or Android."""
-    names = (
-        ("com.apple.quicktime.make", "com.apple.quicktime.model"),
-        ("com.android.manufacturer", "com.android.model"),
-    )
-    for make, model in (tuple(one_line(tags.get(key, "").replace("\0", " "), 60) for key in keys) for keys in names):
-        if model:
-            return model if model.casefold().startswith(make.casefold()) else f"{make} {model}"
+    """Make and model of the camera in the tags of a video: QuickTime or Android."""
+    makes = ("com.apple.quicktime.make", "com.android.manufacturer", "make")
+    for make, model in zip(makes, ("com.apple.quicktime.model", "com.android.model", "model"), strict=True):
+        if tags.get(model):
+            return camera_name(tags.get(make), tags[model])
     return None
 
 

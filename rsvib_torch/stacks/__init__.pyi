@@ -4,6 +4,7 @@ from .memory import check_stack_fits as check_stack_fits
 from .process import iterate_stack as iterate_stack
 from .process import process_stack as process_stack
 from .recorded_motion import align_stack as align_stack
+from .recorded_motion import mask_of_regions as mask_of_regions
 from .run_folder import StackReport as StackReport
 from .run_folder import work_folder as work_folder
 from .window_restoration import RestoredFrames as RestoredFrames

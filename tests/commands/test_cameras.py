@@ -9,6 +9,7 @@ from importlib.resources import files
 import av
 import numpy as np
 import pytest
+from PIL import ExifTags, Image
 from program import refused, rsvib
 
 import rsvib_torch as rsv
@@ -144,6 +145,22 @@ def test_camera_that_a_video_names(capsys, tags, camera):
     assert f'--camera "{camera}" takes row time' in error
     assert rsvib("init", "clip.mp4", "--exposure", "1ms", "--camera", camera) == 0
     assert sensor()["row_time"] == pytest.approx(15.52e-3 / 2160, rel=0.01)
+
+
+@pytest.mark.parametrize("kind", ["jpg", "png"])
+def test_camera_that_images_name(place, capsys, kind):
+    exif = Image.Exif()
+    exif[ExifTags.Base.Make], exif[ExifTags.Base.Model] = "Google", "Pixel 8\0"
+    (place / "frames").mkdir()
+    for number in range(2):
+        Image.new("L", (2048, 1536), 40 + number).save(place / "frames" / f"{number}.{kind}", exif=exif)
+    assert rsv.read_stack_info("frames").camera == "Google Pixel 8"
+    assert '--camera "Google Pixel 8" takes row time 2.949 ± 0.091 us' in refused(
+        capsys, "init", "frames", "--exposure", "1ms", "--frame-rate", "24"
+    )
+    assert "The file names its camera, Google Pixel 8: no mode of Google Pixel 8" in refused(
+        capsys, "init", "frames", "--exposure", "1ms", "--frame-rate", "30"
+    )
 
 
 def test_files_without_a_camera_or_of_an_unknown_one(capsys):

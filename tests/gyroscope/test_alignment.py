@@ -46,6 +46,7 @@ def test_command_does_not_restore_with_a_motion_that_does_not_fit(tmp_path, caps
     for command, message in (
         ((*arguments, gyroscope, *focal, "--offset", 813.35), "the frames need"),
         ((*arguments, gyroscope, *focal), "--unit rad/s needs --offset"),
+        ((*arguments, gyroscope, *focal, "--offset", CLOCK, "--ignore", "60:"), "--ignore is for a gyroscope"),
         ((*arguments, gyroscope), "needs a focal_length"),
     ):
         assert message in refused(capsys, *command)

@@ -157,14 +157,21 @@ def test_command_estimates_clock_and_row_time(frames, tmp_path, capsys):
     assert "axes and clock of a gyroscope are estimated from the frames" in refused(capsys, *arguments, *alone)
 
 
-def test_rows_that_do_not_count():
+def test_rows_that_do_not_count(tmp_path, capsys):
     """A dashboard on two thirds of the frames hides the axes and the clock."""
-    frames = take(TIMING, dashboard=130)
-    ignore = torch.zeros(frames.shape[1:], dtype=torch.bool)
-    ignore[70:] = True
-    hidden, found = (rsv.align_motion(frames, TIMING, recorded("ZXY"), ignore=mask) for mask in (None, ignore))
-    assert not hidden.reliable
-    assert (found.orientation, found.offset) == ("ZXY", pytest.approx(OFFSET, abs=5e-4))
+    rsv.write_stack(tmp_path / "frames.tif", take(TIMING, dashboard=130))
+    (tmp_path / "camera.toml").write_text("[sensor]\nrow_time = 8e-5\nexposure_rows = 10\nframe_rows = 420\n")
+    write_rates(tmp_path / "rates.csv", recorded("ZXY"))
+    known = ("restore", tmp_path / "frames.tif", tmp_path / "out.tif", "--config", tmp_path / "camera.toml")
+    known += ("--motion", tmp_path / "rates.csv", "--device", "cpu", "--force", "--overwrite", "--json")
+    found = []
+    for more in ([], ["--ignore", "70:140,:", "--ignore", "140:"]):
+        assert rsvib(*known, *more) == 0
+        found.append(json.loads(capsys.readouterr().out)["alignment"])
+    assert not found[0]["reliable"]
+    assert (found[1]["orientation"], found[1]["offset"]) == ("ZXY", pytest.approx(OFFSET, abs=5e-4))
+    assert "such as 400: or :60,500:, got '70'" in refused(capsys, *known, "--ignore", "70")
+    assert "no pixel of frames of 200 rows and 216 columns" in refused(capsys, *known, "--ignore", "200:")
 
 
 def test_mirrored_axes_are_refused(tracks):
