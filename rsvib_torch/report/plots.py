@@ -33,6 +33,8 @@ from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.numerics.tables import Array
+from rsvib_torch.registration import OffsetCurve
+from rsvib_torch.restoration import RestorationVerdict
 from rsvib_torch.results.presentation import AXIS_NAMES, AXIS_UNITS, FIGURES, figure_png
 from rsvib_torch.stacks import StackManifest
 from rsvib_torch.text import measured_text
@@ -42,6 +44,7 @@ _X_COLOUR, _Y_COLOUR = "#14487a", "#c8102e"
 _AXIS_COLOURS = {"x": _X_COLOUR, "y": _Y_COLOUR}
 _FIT_COLOUR = _Y_COLOUR
 _LEGEND: Table = {"fontsize": 9, "frameon": False}
+_LEGEND_ABOVE: Table = {**_LEGEND, "loc": "lower right", "bbox_to_anchor": (1.0, 1.0)}
 _TITLE: Table = {"loc": "left", "fontsize": 9.5, "color": _INK}
 _HEADING: Table = {"loc": "left", "fontsize": 12, "fontweight": "bold", "color": _INK}
 _OFFSET_TIME = "exposure start of the rows in the earlier frame (ms)"
@@ -305,6 +308,27 @@ def _detected_motion_figure(result: detection.MotionDetection) -> Figure:
     return figure
 
 
+def _verdict_figure(verdict: RestorationVerdict) -> Figure:
+    """Draw the displacement between the frames of each pair before and after restoration, and the improvement."""
+    figure, (panels,) = _panels(10, 3.4, 1, 3)
+    curves = (
+        (verdict.misfit_before, "o-", _X_COLOUR, "frames as taken"),
+        (verdict.misfit_after, "s-", _Y_COLOUR, "after restoration"),
+        (verdict.resolution, ":", _GREY, "smallest visible"),
+    )
+    titles = ("displacement along x (px rms)", "displacement along y (px rms)", "estimated improvement (dB)")
+    for axis, (panel, title) in enumerate(zip(panels, titles, strict=True)):
+        for values, style, colour, label in curves if axis < 2 else ():
+            panel.plot(values[:, axis], style, color=colour, markersize=4, label=label)
+        panel.xaxis.get_major_locator().set_params(integer=True)
+        plain_axes(panel, "pair of frames", title=title)
+        panel.set_ylim(bottom=0 if axis < 2 else None)
+    panels[0].legend(**_LEGEND)
+    panels[2].plot(verdict.predicted_gain, "o-", color=_X_COLOUR, markersize=4)
+    panels[2].axhline(0.0, color=_GREY, linewidth=0.8)
+    return figure
+
+
 @checks_arguments
 def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: Count) -> Figure:
     """Draw point spread functions of 24 rows of frame 0 with the path of the image during their exposure.
@@ -428,6 +452,18 @@ def picture(frame: Tensor) -> Tensor:
     return frame.movedim(0, -1)
 
 
+def _measured_offsets_figure(curve: OffsetCurve) -> Figure:
+    """Draw the measured offsets of each axis, with error bars of one standard deviation if they are known."""
+    times, offsets = 1e3 * curve.times[curve.good], curve.offsets[curve.good]
+    figure, (panels,) = _panels(13, 4.2, 1, 2, sharex=True)
+    for axis, (panel, (name, colour)) in enumerate(zip(panels, _AXIS_COLOURS.items(), strict=True)):
+        std = None if curve.std is None else curve.std[curve.good][:, axis]
+        panel.errorbar(times, offsets[:, axis], std, fmt=".", color=colour, ecolor=_GRID, label="measured")
+        panel.legend(**_LEGEND_ABOVE)
+        plain_axes(panel, _OFFSET_TIME, "offset (px)", heading=f"Offset along {name}")
+    return figure
+
+
 _BLIND_COLOUR = "#ececec"
 _LABELLED_LINES = 6  # per axis; more labels would cover each other
 
@@ -485,7 +521,7 @@ def _rotation_figure(result: gyroscope.RotationAlignment) -> Figure:
         panel.plot(result.times, predicted, color=_FIT_COLOUR, linewidth=1.3, label="gyroscope")
         panel.plot(result.times, measured, "o", color=_X_COLOUR, markersize=3.5, label="frames")
         panel.plot(result.times, difference, color=_GREY, linewidth=1.0, label=f"difference, {rms:.3g} {unit} rms")
-        panel.legend(**_LEGEND, ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0))
+        panel.legend(**_LEGEND_ABOVE, ncols=3)
         heading = "Between consecutive frames" if axis == 0 else ""
         plain_axes(panel, "" if axis < 2 else "time (s)", f"{name} ({unit})", heading=heading)
     return figure
@@ -501,6 +537,8 @@ FIGURES.update(
         Vibration: motion_figure,
         FreeMotion: motion_figure,
         MtfCurve: _mtf_figure,
+        OffsetCurve: _measured_offsets_figure,
+        RestorationVerdict: _verdict_figure,
         StackManifest: lambda manifest: windows_figure(
             [record.start_time for record in manifest.windows], [record.detection for record in manifest.windows]
         ),
