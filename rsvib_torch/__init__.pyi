@@ -54,7 +54,6 @@ from .registration import OffsetCurve as OffsetCurve
 from .registration import register_bands as register_bands
 from .report import comparison_figure as comparison_figure
 from .report import motion_figure as motion_figure
-from .report import mtf_figure as mtf_figure
 from .report import offset_figure as offset_figure
 from .report import psf_figure as psf_figure
 from .report import read_vibration as read_vibration

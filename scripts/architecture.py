@@ -51,7 +51,7 @@ INNER_LAYERS: dict[str, tuple[set[str], ...]] = {
         {"shapes"},
         {"detect"},
     ),
-    "evaluation": ({"quality", "edge_fit", "bound"}, {"edge_spread"}, {"slanted_edge"}),
+    "evaluation": ({"quality", "edge_fit", "bound"}, {"slanted_edge"}),
     "report": ({"results", "plots"}, {"page"}),
     "restoration": (
         {"frame_motion", "observation", "restoration_verdict"},

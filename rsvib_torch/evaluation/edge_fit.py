@@ -1,87 +1,40 @@
 """Edge of a ROI: model of a blurred edge, its fit to all pixels, and checks that it can be measured."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.polynomial.legendre import legder, legval, legvander
 from scipy.optimize import least_squares
 from scipy.special import ndtr
 
 from rsvib_torch.numerics.tables import Array
 
-PARAMETERS = 11  # of ``EdgeFit``
-BLUR, DARK, BRIGHT = 4, 5, 8  # log blur, and values of the sides in the middle of the ROI, among them
-SLOPES = [6, 9]  # slopes of the two sides across the edge
+# Parameters of an edge: polynomial of the line (4), logarithm of the blur in px, dark and bright side (3 each)
+BLUR, DARK, BRIGHT, PARAMETERS = 4, 5, 8, 11
+ACROSS = [DARK + 1, BRIGHT + 1]  # slopes of the two sides across the edge
+_BLUR_LIMITS = np.log([0.05, 60.0])  # of log px
 
 
-def gaussian_edge(distance: Array, sigma: float, slope: float) -> tuple[Array, Array, Array]:
-    """Edge and line spread function of Gaussian optics and square pixels, and the derivative of the first by sigma.
+def gaussian_edge(distance: Array, sigma: float, width: float) -> tuple[Array, Array, Array]:
+    """Edge and line spread function of Gaussian optics and a pixel, and the derivative of the first by sigma.
 
-    The pixel, projected on the normal of the edge, is the convolution of two boxes, as wide as the cosine and the sine
-    of the edge's angle. With the error function of the optics it is a second difference of its second integral, ``J(x)
-    = ((x^2 + sigma^2) Phi(x / sigma) + sigma x phi(x / sigma)) / 2``. Distances are in px along the normal, positive on
-    the bright side; ``slope`` is the tangent of the angle between edge and pixel.
+    Distances (N,) are in px along the normal, positive on the bright side; ``width`` is that of the pixel along it.
     """
-    wide = 0.5 / math.hypot(1.0, slope)
-    narrow = wide * abs(slope)
-    # evaluated on the dark side: on the bright side, differences of large numbers lose precision
-    ends = np.array([wide + narrow, wide - narrow, narrow - wide, -wide - narrow])
-    x = ends - np.abs(distance)[:, None]
-    below, density = ndtr(x / sigma), np.exp(-0.5 * (x / sigma) ** 2) / math.sqrt(2 * math.pi)
-    signs = np.array([1, -1, -1, 1]) / (4 * wide * narrow)
-    value = 0.5 * ((x**2 + sigma**2) * below + sigma * x * density) @ signs
-    by_distance, by_sigma = (x * below + sigma * density) @ signs, sigma * below @ signs
-    bright = distance > 0
-    return np.where(bright, 1 - value, value), by_distance, np.where(bright, -by_sigma, by_sigma)
+    ends = (distance[:, None] + np.array([0.5, -0.5]) * width) / sigma
+    below, density = ndtr(ends), np.exp(-0.5 * ends**2) / math.sqrt(2 * math.pi)
+    between = np.array([1, -1]) / width
+    return sigma * (ends * below + density) @ between, below @ between, density @ between
 
 
-# --- Fit ---
+@dataclass(frozen=True, eq=False)
+class Edge:
+    """A ROI turned so that its edge is near-vertical and brightens to the right, and the parameters of the edge."""
 
-
-@dataclass(frozen=True)
-class Scatter:
-    """Pixels (N,) of a ROI turned so that the edge is near-vertical and brightens to the right."""
-
-    value: Array  # grey values
-    x: Array  # columns from the middle of the ROI, px
-    y: Array  # rows from the middle of the ROI, px
-    half: tuple[float, float]  # half width and half height of the ROI in px
-    columns: int  # of the turned ROI
+    roi: Array  # (h, w)
     near_vertical: bool  # whether the edge was near-vertical before the ROI was turned
     mirrored: bool  # whether the ROI was mirrored
-
-    @classmethod
-    def of(cls, roi: Array) -> "Scatter":
-        """Turn a ROI so that its edge is near-vertical and brightens to the right."""
-        soft = _means(roi)
-        near_vertical = bool(np.square(np.diff(soft, axis=1)).mean() >= np.square(np.diff(soft, axis=0)).mean())
-        roi = roi if near_vertical else roi.T
-        quarter = roi.shape[1] // 4 + 1
-        mirrored = bool(roi[:, :quarter].mean() > roi[:, -quarter:].mean())
-        roi = roi[:, ::-1] if mirrored else roi
-        half = (0.5 * (roi.shape[1] - 1), 0.5 * (roi.shape[0] - 1))
-        y, x = np.indices(roi.shape, dtype=np.float64).reshape(2, -1)
-        return cls(roi.flatten(), x - half[0], y - half[1], half, roi.shape[1], near_vertical, mirrored)
-
-    def along(self, y: Array) -> tuple[Array, Array]:
-        """Legendre polynomials (N, 4) along the edge, and their slopes per px."""
-        u = y / self.half[1]
-        return legvander(u, 3), legval(u, legder(np.eye(4))).T / self.half[1]
-
-    @property
-    def across(self) -> Array:
-        """Regressors (N, 3) of the brightness of a side: value in the middle, slopes to the right and down."""
-        return np.stack([np.ones_like(self.x), self.x / self.half[0], self.y / self.half[1]], axis=1)
-
-
-@dataclass(frozen=True)
-class EdgeFit:
-    """Edge, blur and sides: 11 parameters, as in ``linearised``."""
-
-    parameters: Array
-    scatter: Scatter
+    parameters: Array  # (11,) lines and sides are polynomials of the place in the ROI, which is -1 ... 1
 
     @property
     def sigma(self) -> float:
@@ -89,9 +42,9 @@ class EdgeFit:
         return math.exp(self.parameters[BLUR])
 
     @property
-    def sides(self) -> Array:
-        """(2, 3) dark and bright side: value in the middle, slopes to the right and down per half ROI."""
-        return self.parameters[DARK:].reshape(2, 3)
+    def width(self) -> float:
+        """Standard deviation of the line spread function in px."""
+        return math.sqrt(self.sigma**2 + 1 / 12)  # with the variance of a pixel aperture
 
     @property
     def contrast(self) -> float:
@@ -99,89 +52,97 @@ class EdgeFit:
         return float(self.parameters[BRIGHT] - self.parameters[DARK])
 
     @property
-    def width(self) -> float:
-        """Standard deviation of the line spread function in px."""
-        return math.sqrt(self.sigma**2 + 1 / 12)  # with the variance of a pixel aperture
-
-    @property
     def slope(self) -> float:
         """Columns per row in the middle of the edge."""
-        return float((self.scatter.along(np.zeros(1))[1] @ self.parameters[:BLUR])[0])
+        return float(self.parameters[1]) * 2 / (len(self.roi) - 1)
+
+    @property
+    def pixel(self) -> float:
+        """Width of a pixel along the normal in px; its smaller width along the edge is a part of the blur."""
+        return 1 / math.hypot(1.0, self.slope)
 
     @property
     def angle(self) -> float:
         """Degrees between the edge and the nearest image axis in the middle of the edge, positive clockwise."""
         turn = math.degrees(math.atan(self.slope))
-        return turn if self.scatter.mirrored == self.scatter.near_vertical else -turn
+        return turn if self.mirrored == self.near_vertical else -turn
+
+    def across(self) -> Array:
+        """Regressors (N, 3) of the brightness of a side: 1, and the place of the pixel across and along the edge."""
+        row, column = np.meshgrid(*(np.linspace(-1.0, 1.0, count) for count in self.roi.shape), indexing="ij")
+        return np.stack([np.ones(row.size), column.ravel(), row.ravel()], axis=1)
 
     def distance(self) -> tuple[Array, Array]:
-        """Distance of every pixel along the normal, and its derivatives (N, 4) by the line."""
-        values, slopes = self.scatter.along(self.scatter.y)
+        """Distance (N,) of every pixel along the normal in px, and its derivatives (N, 4) by the line."""
+        half_height, half_width = (0.5 * (count - 1) for count in self.roi.shape)
+        (_, column, row), powers = self.across().T, np.arange(4)
+        values = row[:, None] ** powers
+        slopes = powers * row[:, None] ** np.maximum(powers - 1, 0) / half_height
         line = self.parameters[:BLUR]
-        slope, aside = slopes @ line, self.scatter.x - values @ line
+        slope, aside = slopes @ line, column * half_width - values @ line
         cosine = 1 / np.hypot(1, slope)
-        derivative = -values * cosine[:, None] - slopes * (aside * slope * cosine**3)[:, None]
-        return aside * cosine, derivative
+        return aside * cosine, -values * cosine[:, None] - slopes * (aside * slope * cosine**3)[:, None]
 
-    def linearised(self) -> tuple[Array, Array]:
-        """Model value (N,), and derivatives (N, 11) by line, log sigma, dark and bright side."""
+    def contrasts(self) -> Array:
+        """Bright minus dark (N,) at every pixel."""
+        dark, bright = self.parameters[DARK:].reshape(2, 3) @ self.across().T
+        return bright - dark
+
+    def moved(self, parameters: Array) -> "Edge":
+        """The same ROI with an edge of other parameters."""
+        return replace(self, parameters=parameters)
+
+    def linearised(self, departure: Array | float = 0.0) -> tuple[Array, Array]:
+        """Model value (N,) with Gaussian optics, and derivatives (N, 11) by the parameters.
+
+        The line spread function of the pixels (N,) that is the derivative by the line may have a ``departure``.
+        """
         distance, by_line = self.distance()
-        esf, lsf, by_sigma = gaussian_edge(distance, self.sigma, self.slope)
-        regressors = self.scatter.across
-        dark, bright = self.sides @ regressors.T
-        jacobian = np.column_stack(
-            [
-                ((bright - dark) * lsf)[:, None] * by_line,
-                (bright - dark) * by_sigma * self.sigma,
-                (1 - esf)[:, None] * regressors,
-                esf[:, None] * regressors,
-            ]
-        )
-        return dark + (bright - dark) * esf, jacobian
-
-    def moved(self, step: Array) -> "EdgeFit":
-        """The fit after a step of its parameters, of which that of the blur is limited."""
-        parameters = self.parameters + step
-        blur = self.parameters[BLUR] + np.clip(step[BLUR], -1.0, 1.0)
-        parameters[BLUR] = np.clip(blur, *_BLUR_LIMITS)
-        return EdgeFit(parameters, self.scatter)
+        esf, lsf, by_sigma = gaussian_edge(distance, self.sigma, self.pixel)
+        across = self.across()
+        dark, bright = self.parameters[DARK:].reshape(2, 3) @ across.T
+        contrast = bright - dark
+        line = (contrast * (lsf + departure))[:, None] * by_line
+        blur = contrast * by_sigma * self.sigma
+        jacobian = np.column_stack([line, blur, (1 - esf)[:, None] * across, esf[:, None] * across])
+        return dark + contrast * esf, jacobian
 
 
-# part of the range of the values of a region by which its sides differ at least; otherwise the start of the fit is not
-# finite
-_LEAST_STEP = 1e-3
-_BLUR_LIMITS = np.log([0.05, 60.0])  # of log px
+# --- Fit ---
 
 
-def _start_edge(scatter: Scatter) -> EdgeFit:
-    """Start of the fit, from the sum of every row: robust to noise."""
-    columns = scatter.columns
-    image = scatter.value.reshape(-1, columns)
-    few = max(2, columns // 12)
-    low, high = image[:, :few].mean(), image[:, -few:].mean()
-    if high - low < _LEAST_STEP * np.ptp(image):
+def fit_edge(roi: Array) -> Edge:
+    """Least-squares fit of edge, Gaussian blur and sides to all pixels of a ROI (h, w)."""
+    # 1. Turn the ROI.
+    soft = _means(roi)
+    near_vertical = bool(np.square(np.diff(soft, axis=1)).mean() >= np.square(np.diff(soft, axis=0)).mean())
+    roi = roi if near_vertical else roi.T
+    quarter = roi.shape[1] // 4 + 1
+    mirrored = bool(roi[:, :quarter].mean() > roi[:, -quarter:].mean())
+    roi = np.ascontiguousarray(roi[:, ::-1] if mirrored else roi)
+    # 2. Start from the sum of every row, which is robust to noise.
+    height, width = roi.shape
+    few = max(2, width // 12)
+    low, high = roi[:, :few].mean(), roi[:, -few:].mean()
+    least = 1e-3  # of the range of the values; otherwise the start is not finite
+    if high - low < least * np.ptp(roi):
         raise ValueError("no edge: both sides of the roi are equally bright; choose a part with a single edge")
-    dark = ((high - image) / (high - low)).mean(1) * columns  # columns of each row
-    rows = scatter.along(scatter.y[::columns])[0][:, :2]
-    line = np.linalg.lstsq(rows, dark - 0.5 * columns)[0]
-    return EdgeFit(np.array([*line, 0, 0, math.log(1.5), low, 0, 0, high, 0, 0]), scatter)
-
-
-def fit_edge(scatter: Scatter) -> EdgeFit:
-    """Least-squares fit of edge, Gaussian blur and sides to all pixels."""
-    start = _start_edge(scatter).parameters
-    lowest, highest = np.full((2, PARAMETERS), [[-np.inf], [np.inf]])
-    lowest[BLUR], highest[BLUR] = _BLUR_LIMITS
+    place = ((high - roi) / (high - low)).mean(1) * width - 0.5 * width  # columns of each row
+    line = np.polynomial.polynomial.polyfit(np.linspace(-1.0, 1.0, height), place, 1)
+    start = Edge(roi, near_vertical, mirrored, np.array([*line, 0, 0, math.log(1.5), low, 0, 0, high, 0, 0]))
+    # 3. Fit all parameters.
+    limits = np.full((2, PARAMETERS), [[-np.inf], [np.inf]])
+    limits[:, BLUR] = _BLUR_LIMITS
     found = least_squares(
-        lambda parameters: EdgeFit(parameters, scatter).linearised()[0] - scatter.value,
-        start,
-        lambda parameters: EdgeFit(parameters, scatter).linearised()[1],
-        bounds=(lowest, highest),
+        lambda parameters: start.moved(parameters).linearised()[0] - roi.ravel(),
+        start.parameters,
+        lambda parameters: start.moved(parameters).linearised()[1],
+        bounds=tuple(limits),
         x_scale="jac",
         **dict.fromkeys(("ftol", "xtol", "gtol"), 1e-12),
         max_nfev=100,
     )
-    return EdgeFit(found.x, scatter)
+    return start.moved(found.x)
 
 
 # --- Checks ---
@@ -205,41 +166,40 @@ def check_roi(roi: Array) -> None:
         raise ValueError(f"roi shows no edge: all pixels are {roi[0, 0]:g}")
 
 
-def check_edge(fit: EdgeFit, limits: tuple[float, float]) -> float:
+def check_edge(edge: Edge, limits: tuple[float, float]) -> float:
     """Raise if the ROI does not contain one measurable slanted edge, of values within ``limits``.
 
     The result is the smallest distance in px between the edge and a border of the turned ROI beside it.
     """
-    scatter, contrast = fit.scatter, fit.contrast
-    residual, distance = scatter.value - fit.linearised()[0], fit.distance()[0]
-    explained = 1 - residual.var() / scatter.value.var()
+    distance, contrast = edge.distance()[0].reshape(edge.roi.shape), edge.contrast
+    residual = edge.roi - edge.linearised()[0].reshape(edge.roi.shape)
+    explained = 1 - residual.var() / edge.roi.var()
     if not explained >= 0.5 or not contrast > 0:
         raise ValueError(
             f"roi shows no edge: a straight edge explains {100 * max(explained, 0.0):.0f} % of the variance, "
             "expected at least 50 %"
         )
-    angle = abs(fit.angle)
+    angle = abs(edge.angle)
     if not 2.0 <= angle <= 40.0:
         problem = "not slanted enough" if angle < 2.0 else "too close to 45 degrees"
         raise ValueError(f"the edge is {problem}: {angle:.2f} degrees from the nearest image axis, expected 2 ... 40")
-    rays = distance.reshape(-1, scatter.columns)
-    crossed = abs(fit.slope) * len(rays)
+    crossed = abs(edge.slope) * len(edge.roi)
     if crossed < 1:
         raise ValueError(
-            f"the edge crosses {crossed:.2f} px over {len(rays)} px of length, expected at least 1: "
+            f"the edge crosses {crossed:.2f} px over {len(edge.roi)} px of length, expected at least 1: "
             "use a longer roi or a larger angle"
         )
-    room = float(min(-rays[:, 0].max(), rays[:, -1].min()))
-    wanted = max(4.0, 3.0 * fit.width)
+    room = float(min(-distance[:, 0].max(), distance[:, -1].min()))
+    wanted = max(4.0, 3.0 * edge.width)
     if room < wanted:
         raise ValueError(
             f"the edge comes within {max(room, 0.0):.1f} px of the border of the roi, expected at least {wanted:.1f} px"
         )
-    _check_clipping(fit, distance, limits)
+    far = np.abs(distance) > 4 * edge.width
+    _check_clipping(edge.roi[(distance < 0) & far], edge.roi[(distance > 0) & far], contrast, limits)
     # patches of 5 x 5 px of the sides, and the standard deviation of their mean residual due to noise
-    patches = np.abs(_means(np.where(np.abs(distance) > 4 * fit.width + 2, residual, 0.0).reshape(rays.shape)))
-    steps = np.abs(np.diff(residual.reshape(rays.shape), axis=1))
-    noise = np.median(steps) / 0.954 / 5  # 0.954: median absolute difference of two standard normal numbers
+    patches = np.abs(_means(np.where(np.abs(distance) > 4 * edge.width + 2, residual, 0.0)))
+    noise = np.median(np.abs(np.diff(residual, axis=1))) / 0.954 / 5  # 0.954: median of |a - b| of normal numbers
     worst = patches.max()
     if worst > 0.1 * contrast + 6 * noise:
         row, column = np.unravel_index(patches.argmax(), patches.shape)
@@ -250,22 +210,20 @@ def check_edge(fit: EdgeFit, limits: tuple[float, float]) -> float:
     return room
 
 
-def _check_clipping(fit: EdgeFit, distance: Array, limits: tuple[float, float]) -> None:
+def _check_clipping(dark: Array, bright: Array, contrast: float, limits: tuple[float, float]) -> None:
     """Raise if a tenth of the pixels of a side have one extreme value although noise would exceed it."""
-    value, far = fit.scatter.value, np.abs(distance) > 4 * fit.width
-    sides = [value[(distance < 0) & far], value[(distance > 0) & far]]
-    if min(map(len, sides)) == 0:
+    if not len(dark) or not len(bright):
         return
-    extremes = (value.min(), value.max())
-    shares = [(side == extreme).mean() for side, extreme in zip(sides, extremes, strict=True)]
-    least_noise = 1e-3 * fit.contrast
-    at_limits = (extremes[0] <= limits[0], extremes[1] >= limits[1])
+    ends, sides = (dark.min(), bright.max()), (dark, bright)
+    shares = [(side == end).mean() for side, end in zip(sides, ends, strict=True)]
+    least_noise = 1e-3 * contrast
+    at_limits = (ends[0] <= limits[0], ends[1] >= limits[1])
     for index, name in enumerate(("dark", "bright")):
-        extreme, share = extremes[index], shares[index]
-        has_noise = np.sqrt(np.square(sides[index] - extreme).mean()) > least_noise
-        only_this = shares[1 - index] < 0.1 * share and sides[1 - index].std() > least_noise
+        has_noise = np.sqrt(np.square(sides[index] - ends[index]).mean()) > least_noise
+        only_this = shares[1 - index] < 0.1 * shares[index] and sides[1 - index].std() > least_noise
         is_black = index == 0 and at_limits[0]  # without light there is no noise
-        if share >= 0.1 and ((at_limits[index] and has_noise) or (only_this and not is_black)):
+        if shares[index] >= 0.1 and ((at_limits[index] and has_noise) or (only_this and not is_black)):
             raise ValueError(
-                f"the {name} side of the edge is clipped: {100 * share:.0f} % of its pixels are exactly {extreme:g}"
+                f"the {name} side of the edge is clipped: {100 * shares[index]:.0f} % of its pixels are exactly "
+                f"{ends[index]:g}"
             )

@@ -2,7 +2,6 @@ from .page import Report as Report
 from .page import write_report_page as write_report_page
 from .plots import comparison_figure as comparison_figure
 from .plots import motion_figure as motion_figure
-from .plots import mtf_figure as mtf_figure
 from .plots import offset_figure as offset_figure
 from .plots import psf_figure as psf_figure
 from .plots import save_figure as save_figure

@@ -3,7 +3,7 @@
 import math
 import os
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import numpy as np
@@ -366,28 +366,17 @@ def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: Count) -> Figu
     return figure
 
 
-@checks_arguments
-def mtf_figure(curves: Mapping[str, Sequence[MtfCurve]]) -> Figure:
-    """Draw modulation transfer functions of slanted edges: thin lines for the edges, a bold line for their mean.
-
-    Args:
-        curves: Measured edges of the input and of the restored frame, or of one image, by the name in the legend.
-
-    Example:
-        >>> figure = mtf_figure({"raw": [raw_curve], "restored": [restored_curve]})  # doctest: +SKIP
-    """
+def _mtf_figure(curve: MtfCurve) -> Figure:
+    """Draw the modulation transfer function of a slanted edge with a band of two standard deviations."""
     figure, ((panel,),) = _panels(5.6, 3.9)
-    frequency = torch.linspace(0, 0.5, 101, dtype=torch.float64, device="cpu")
-    for colour, (name, edges) in zip((_GREY, _X_COLOUR)[-len(curves) :], curves.items(), strict=True):
-        values = [edge.at(frequency.to(edge.lsf.device)).cpu() for edge in edges]
-        for value in values:
-            panel.plot(frequency, value, color=colour, linewidth=0.7, alpha=0.5)
-        panel.plot(frequency, torch.stack(values).mean(0), color=colour, linewidth=2.0, label=name)
+    shown = curve.frequency <= 0.5
+    frequency, mtf, reach = curve.frequency[shown], curve.mtf[shown], 2 * curve.std[shown]
+    panel.plot(frequency, mtf, color=_X_COLOUR, linewidth=1.6)
+    panel.fill_between(frequency, mtf - reach, mtf + reach, color=_X_COLOUR, alpha=0.2, linewidth=0)
     panel.axhline(0.5, color=_GREY, linewidth=0.8, linestyle="--", zorder=0)
-    panel.set_xlim(0, 0.5)
-    panel.set_ylim(0, max(1.05, panel.get_ylim()[1]))
-    panel.legend(**_LEGEND)
-    plain_axes(panel, "spatial frequency (cycles/px)", "MTF")
+    title = f"MTF50 {measured_text(curve.mtf50, curve.mtf50_std)} cycles/px"
+    plain_axes(panel, "spatial frequency (cycles/px)", "MTF", title=title)
+    panel.set(xlim=(0, 0.5), ylim=(0, None))
     return figure
 
 
@@ -547,7 +536,7 @@ FIGURES.update(
         gyroscope.RotationAlignment: _rotation_figure,
         Vibration: motion_figure,
         FreeMotion: motion_figure,
-        MtfCurve: lambda curve: mtf_figure({f"MTF50 {measured_text(curve.mtf50, curve.mtf50_std)} cycles/px": [curve]}),
+        MtfCurve: _mtf_figure,
         OffsetCurve: _measured_offsets_figure,
         RestorationVerdict: _verdict_figure,
         StackManifest: lambda manifest: windows_figure(

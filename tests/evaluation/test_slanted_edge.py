@@ -88,6 +88,19 @@ def test_optics_of_any_shape(name):
     assert float(noisy.mtf50) == pytest.approx(mtf50_of(truth), rel=0.03)
 
 
+def test_standard_deviations_contain_light_beyond_the_roi():
+    optics = OPTICS["diffraction, cut-off 0.6 cycles/px"]
+    truth, image = through_pixels(optics, 5.2), draw_edge_of(optics, 5.2)
+    errors, pulls = [], []
+    for seed in range(3):
+        curve = measure(image + 0.008 * np.random.default_rng(seed).standard_normal(image.shape))
+        shown = slice(2, 51)  # 0.02 ... 0.5 cycles/px
+        errors.append((curve.mtf.numpy() - truth(curve.frequency.numpy()))[shown])
+        pulls.append(errors[-1] / curve.std.numpy()[shown])
+    assert np.sqrt(np.mean(np.square(errors))) < 0.008
+    assert 0.4 < np.sqrt(np.mean(np.square(pulls))) < 2.0
+
+
 def test_rotation_mirroring_and_inversion_do_not_change_the_result():
     image = draw_edge(5.2, 0.6) + 0.008 * np.random.default_rng(5).standard_normal((120, 80))
     curve = measure(image)
