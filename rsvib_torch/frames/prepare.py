@@ -191,7 +191,8 @@ def prepare_frames(
     given = as_tensor(name, loaded.frames)
     axis = channel_axis(name, given.shape, channels)
     in_memory = loaded.frames is frames  # files state which axis has the channels
-    if given.ndim > 3 and channels is None and in_memory and given.shape[-3] not in (1, 3, 4):
+    usual = (1, 3, 4) if given.ndim == 4 else (1, 2, 3, 4)  # two images of (T, 2, H, W) may be two of a batch
+    if given.ndim > 3 and channels is None and in_memory and given.shape[-3] not in usual:
         raise other_axes(name, tuple(given.shape))
     # missing pixels become 0 and are marked, so that all further steps compute with finite numbers
     missing = _missing_pixels(given, ignore, allow_missing, axis)

@@ -9,7 +9,6 @@ from dataclasses import replace
 from functools import cache
 from importlib.resources import files
 
-import numpy as np
 from pydantic import TypeAdapter
 
 from rsvib_torch.checks.values import check_number, check_whole_number, described, options
@@ -157,7 +156,7 @@ def camera_mode(name: str, *, width: int, height: int, frame_rate: float) -> Cam
     ]
     if not modes:  # of "iPhone 7", "iPhone 7 Plus" is another camera
         raise _unknown(name, found)
-    sized = [mode for mode in modes if np.allclose((mode.width, mode.height), size, rtol=_SAME_SIZE, atol=0.0)]
+    sized = [one for one in modes if max(abs(one.width / size[0] - 1), abs(one.height / size[1] - 1)) <= _SAME_SIZE]
     fitting = [mode for mode in sized if math.isclose(mode.frame_rate, rate, rel_tol=_SAME_RATE)]
     if not fitting:
         known = ", ".join(
