@@ -203,8 +203,8 @@ def assumptions(
         effects += _tones_of_lamps(tones, amplitudes[stack], 0.1 / (num_frames * timing.frame_period))
         if any(contradicted[stack : stack + 1]):
             effects.append(
-                "readout direction, frame_rows and row_time: tones do not explain the other axis, as with a wrong "
-                "timing; the motion along it may also be none of tones"
+                "readout direction, frame_rows and row_time: the tones of the other axis are not known, as with a "
+                "wrong timing; the motion along it may also be none of tones"
             )
         of_stacks.append((*sentences, *effects) if tones else ())
     return tuple(of_stacks)

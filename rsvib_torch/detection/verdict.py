@@ -266,7 +266,7 @@ def with_remedy(reasons: Iterable[Reason], remedy: str) -> tuple[Reason, ...]:
 
 def contradicted_axes(findings: Findings) -> list[bool]:
     """Whether the measured rows contradict the tones of x and y, so that another timing may be the cause."""
-    codes = {"too_many_tones", "rows_unexplained", "neighbours_unexplained"}
+    codes = {"too_many_tones", "rows_unexplained", "neighbours_unexplained", "displacement_ambiguous"}
     return [any(reason.code in codes for reason in of_axis) for of_axis in findings[:2]]
 
 

@@ -165,7 +165,16 @@ def test_an_axis_beside_one_that_is_contradicted_has_an_assumption():
 
     found = detect_vibration(recorded((HEIGHT, WIDTH), TIMING, Curve(curve), 4, 0.005, seed=8), TIMING)
     assert found.reliable.tolist() == [True, False]
-    assert "tones do not explain the other axis" in found.assumptions[-1]
+    assert "the tones of the other axis are not known" in found.assumptions[-1]
+
+
+def test_a_reversed_readout_is_named_where_it_needs_further_tones():
+    """Four frames agree with two tones along x, which was reliable and wrong, and with none that are known along y."""
+    timing = SensorTiming(row_time=1.45e-4, exposure_rows=12, frame_rows=1 / RATE / 1.45e-4)
+    frames = recorded((200, 160), timing, Motion((0.12, 0.21), (34.3, 55.7), (0.5, 5.1)), 4, 0.005, seed=10)
+    found = detect_vibration(frames, replace(timing, readout_direction="reverse"))
+    assert found.reliable.tolist() == [False, False]
+    assert {one.code for one in causes(found)} == {"other_readout_direction"}
 
 
 BLURRED_SIZE = 192, 160
