@@ -25,7 +25,8 @@ class LiveOptions(CameraOptions):
     """Options of ``live``."""
 
     source: str = argument()
-    """Number or URL of a camera, - for a video on standard input, or a file with frames."""
+    """Number or URL of a camera, a file with frames, or - for a video on standard input that can be read from a pipe
+    (Matroska, MPEG-TS, fragmented MP4)."""
     out: Path | None = None
     """Video to write (.mp4, .mov, .m4v, .mkv), or - for raw frames to stdout."""
     tracker: Annotated[
@@ -59,7 +60,7 @@ def live_session(given: LiveOptions) -> Answer:
     restoration = {name: value for name, value in settings.restoration.items() if name in available}
     source: video.CameraSource | video.FileSource
     if camera:
-        number = "pipe:0" if given.source == "-" else given.source
+        number = video.STANDARD_INPUT if given.source == "-" else given.source
         source = video.CameraSource(int(number) if number.isdecimal() else number, settings.timing, given.full_scale)
     else:
         source = video.FileSource(Path(given.source), settings.timing, given.full_scale or settings.full_scale)
@@ -77,7 +78,7 @@ def live_session(given: LiveOptions) -> Answer:
         )
         report = video.run_live(source, tracker, outputs)
     if report.frames == 0:
-        raise ValueError(f"{given.source}: no frame was read")
+        raise ValueError(video.NOT_A_VIDEO if given.source == "-" else f"{given.source}: no frame was read")
     slow = "dropped, because processing was too slow (fewer --columns)"
     missing = {slow: report.dropped, "not delivered by the source": report.lost}
     parts = [f"{number_of(count, 'frame')} {why}" for why, count in missing.items() if count]

@@ -147,7 +147,7 @@ class StackCommand(CameraOptions):
             return self.full_scale
         if stated is None and configured is None:
             unknown = f"{self.frames}: the full scale of its {self.info.dtype} counts is not known"
-            raise ValueError(f"{unknown}: give --full-scale, e.g. 4095 for 12 bits, or full_scale in [sensor]")
+            raise ValueError(f"{unknown}: give --full-scale, e.g. 4095 for 12 bits, or state it in [sensor]")
         return configured if stated is None else stated
 
     def print_notes(self) -> None:

@@ -34,6 +34,8 @@ def known_full_scale(dtype: np.dtype, stated: object = None) -> float | None:
 
 def required_full_scale(full_scale: object, dtype: np.dtype, name: object) -> float:
     """As ``known_full_scale`` of integers; the error names a file or an argument if it is unknown."""
+    if dtype.kind == "b":
+        raise TypeError(f"{name} must be real numbers, got {dtype}; pass {name}.float()")
     known = known_full_scale(dtype, full_scale)
     if known is None:
         raise ValueError(

@@ -248,7 +248,7 @@ def find_bands(profiles: Profiles) -> tuple[BandFit, SceneModel]:
         raise ValueError(
             "no flicker found: no bands of the same period across all columns exceed the texture of the scene; at "
             f"least {MIN_PERIODS:g} periods of the flicker must fit into a frame with visible contrast; two or more "
-            "frames of a still scene eliminate its texture; vertical bands need scan_axis='x'"
+            "frames of a still scene eliminate its texture; bands must follow each other along scan_axis"
         )
     best, model = min(trusted, key=lambda item: item[0].period_std / item[0].period)
     if best.period < _MIN_PERIOD:
@@ -259,7 +259,7 @@ def find_bands(profiles: Profiles) -> tuple[BandFit, SceneModel]:
     if brightness.shape[1] / best.period < MIN_PERIODS:
         raise ValueError(
             f"flicker is slower than a frame: {brightness.shape[1] / best.period:.2f} periods in its rows, at least "
-            f"{MIN_PERIODS:g} are needed; use a faster flicker; vertical bands need scan_axis='x'"
+            f"{MIN_PERIODS:g} are needed; use a faster flicker; bands must follow each other along scan_axis"
         )
     return best, model
 

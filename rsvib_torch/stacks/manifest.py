@@ -142,6 +142,16 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
         """The totals as lines of text: about the vibration, and about the restoration."""
         data = self.totals()
         vibration = self._tone_lines(data["tones"]) if self.gyroscope is None else _gyroscope_lines(self.gyroscope)
+        found = [record.detection for record in self.windows]
+        if "video" not in self.settings and all(
+            one is not None and {reason.code for of_axis in one.findings for reason in of_axis} == {"no_tone"}
+            for one in found
+        ):
+            text = "the camera stands still, or moves uniformly or by less than the noise"
+            return [wrapped(f"no window has a significant tone: {text}")], [
+                f"0 of {number_of(len(found), 'window')} restored",
+                *self.losses,
+            ]
         if "video" in self.settings:
             vibration += self._lines_of_video()
         restoration = [f"{data['restored']} of {number_of(data['windows'], 'window')} restored"]

@@ -275,9 +275,9 @@ class StackReport(Summarised):
             lines[0] += f", {self.seconds / self.frames:.2g} s per frame"
         if self.resumed:
             lines.append(f"windows complete before this run: {self.resumed}")
-        if self.failed or self.bad_frames:
-            unusable = f"{number_of(self.bad_frames, 'frame')} could not be used"
-            lines.append(f"{number_of(self.failed, 'window')} failed, {unusable}: see {self.manifest.name}")
+        lost = [(self.failed, "window", "failed"), (self.bad_frames, "frame", "could not be used")]
+        if texts := [f"{number_of(count, what)} {why}" for count, what, why in lost if count]:
+            lines.append(f"{', '.join(texts)}: see {self.manifest.name}")
         return "\n".join(lines)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks.arguments import check_pixels
+from rsvib_torch.checks.arguments import Channels, check_pixels
 from rsvib_torch.detection import MotionDetection, detect_motion, detect_vibration
 from rsvib_torch.detection.shapes.free import vibration_in_place_of
 from rsvib_torch.frames.full_scale import counts_to_frames
@@ -77,17 +77,19 @@ def measured_motion(frames: Tensor, timing: SensorTiming, options: Mapping[str, 
     If the frames agree with a lost one, its time is taken into account. Without options, a motion of any shape is
     measured if the tones may change, and taken if more axes are reliable.
     """
-    detected = detect_vibration(frames, timing, **options)
+    channels: Channels = "first" if frames.ndim == 4 else None  # of files, of any number
+    detected = detect_vibration(frames, timing, channels=channels, **options)
     lost = next((one.details["after"] for one in detected.findings[0] if one.code == "other_frame_times"), None)
     if isinstance(lost, int):
         timing = with_lost_frame(timing, len(frames), lost)
-        detected = detect_vibration(frames, timing, **options)
+        detected = detect_vibration(frames, timing, channels=channels, **options)
         return WindowMotion(detected, detected, timing, lost_before=lost)
     if options or not may_change(detected, len(frames)):
         return WindowMotion(detected, detected, timing)
     rows = frames.shape[int(timing.scan_axis)]
     with suppress(ValueError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
-        found = detect_motion(frames, timing, knot_rows=min(24, max(4, rows // _KNOTS)))
+        knot_rows = min(24, max(4, rows // _KNOTS))
+        found = detect_motion(frames, timing, channels=channels, knot_rows=knot_rows)
         if found.reliable.sum() > detected.reliable.sum():
             return WindowMotion(found, _tones_in_place_of(found, detected), timing, reliable_motion(found)[0])
     return WindowMotion(detected, detected, timing)
@@ -189,7 +191,8 @@ def restore_trusted(
         vibration, left_alone = vibration_to_undo(motion, timing)
     frames = frames if first_frames is None else frames[:first_frames]
     joint, scale, optics = options.joint, options.scale, check_optics(options.optics)
-    prepared = prepare_frames(frames, timing, saturation=options.saturation, mosaic=options.mosaic)
+    channels: Channels = "first" if frames.ndim == 4 else None
+    prepared = prepare_frames(frames, timing, channels=channels, saturation=options.saturation, mosaic=options.mosaic)
     lost = prepared.lost_rows()
     if not bool(vibration.moving_axes().any()):
         unchanged = prepared.from_row_order(as_taken(prepared, joint, scale))

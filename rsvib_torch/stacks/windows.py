@@ -92,6 +92,18 @@ class WindowResult(Summarised):
         """Whether the frames are restored."""
         return self.restoration is not None and self.restoration.restored
 
+    def summary(self) -> str:
+        """Frames of the window, its vibration, and what was restored."""
+        state = "restored" if self.restored else "unchanged"
+        lines = [f"window {self.window.index}, frames {self.window.first} … {self.window.last}: {state}"]
+        if self.detection is not None:
+            lines.append(self.detection.summary())
+        if self.restoration is not None:
+            lines += map(str, self.restoration.left_alone)
+            lines += [] if self.restoration.verdict is None else [self.restoration.verdict.sentence]
+        lines += [] if self.error is None else [self.error]
+        return "\n".join([*lines, *(f"frame {index}: {fault}" for index, fault in self.bad_frames.items())])
+
 
 @dataclass(frozen=True, eq=False)
 class WindowRecord:

@@ -6,6 +6,7 @@ between (``FrameCounter``).
 """
 
 import math
+import os
 import queue
 import signal
 import threading
@@ -41,6 +42,11 @@ if TYPE_CHECKING:
 
 Frame = NDArray[np.uint8]  # (H, W) grey or (H, W, 3) RGB
 
+STANDARD_INPUT = "pipe:0"  # the name of FFmpeg
+NOT_A_VIDEO = (
+    "standard input is not a video that can be read from a pipe: send Matroska, MPEG-TS or fragmented MP4, or give the "
+    "name of the file"
+)
 _CHECK = 0.05  # s between checks whether the source has ended, or the session
 _LONGEST_READ = 2.0  # s that the end of a session waits for a frame of the source; OpenCV waits 30 s for a camera
 # of FFmpeg: every frame is written when it is encoded, in a fragment (.mp4, .mov, .m4v) or cluster (.mkv) of its own.
@@ -121,17 +127,24 @@ class CameraSource:
         """The frames; times are whole frame periods apart."""
         level = cv2.utils.logging.getLogLevel()
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # only the error below is shown
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
         try:
             capture = cv2.VideoCapture(self._camera)
         finally:
             cv2.utils.logging.setLogLevel(level)
         if not capture.isOpened():
-            raise OSError(f"camera {self._camera} cannot be opened; check its number or URL, and whether it is in use")
+            raise OSError(
+                NOT_A_VIDEO
+                if self._camera == STANDARD_INPUT
+                else f"camera {self._camera} cannot be opened; check its number or URL, and whether it is in use"
+            )
         counter, before = FrameCounter(self._period), -1
         try:
             while (answer := capture.read())[0]:
                 pixels, now = answer[1], time.perf_counter()
-                number = counter.number(now, 1e-3 * capture.get(cv2.CAP_PROP_POS_MSEC))
+                # a pipe may be slower than the camera, and delivers every frame
+                stamp = 1e-3 * capture.get(cv2.CAP_PROP_POS_MSEC)
+                number = before + 1 if self._camera == STANDARD_INPUT else counter.number(now, stamp)
                 self.lost, before = self.lost + number - before - 1, number
                 if pixels.ndim == 3:
                     pixels = np.ascontiguousarray(np.moveaxis(pixels[..., ::-1], -1, 0))

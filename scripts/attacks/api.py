@@ -207,7 +207,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     report = rsv.process_stack(stack, folder / "again.npy", timing, **windows)
     described = (detected.std, curve, optics, sensor_noise, info, report, verdict, calibration, camera)
     described += (tracked,)
-    described += (detected.spectrum(), rsv.CameraMode("A", "B", "", 1920, 1080, 30.0, 0.01, 1e-4, 3, "forward", 1080))
+    described += (detected.spectrum(), rsv.CameraMode("A", "B", "", 1920, 1080, 30.0, 0.01, 1e-4, 3, "forward"))
     described += (detected, detected.offsets, free, rates, rotation)
     for value in described:
         result[type(value).__name__] = _with_fields(value)
@@ -217,7 +217,6 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
         )
     for name, given in (("forward", "scene"), ("A", "x"), ("A_adjoint", "y")):
         result[f"RowVaryingBlur.{name}"] = Call(getattr(blur, name), {given: pool[given]})
-    result["RowVaryingBlur.adjoint"] = Call(blur.adjoint, {"frames": frames[0], "scene_shape": (160, 128)})
     for name in ("displacement", "factors", "rays"):
         result[f"Camera.{name}"] = call(getattr(camera, name), x=times[:2], y=times[2:4])
     missing = set(rsv.__all__) - _NOT_CALLED - {name.partition(" ")[0] for name in result}

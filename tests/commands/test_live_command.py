@@ -61,10 +61,18 @@ def test_from_standard_input_to_a_pipe(clip, capfdbinary):
     with on_standard_input(clip):
         assert rsvib("live", "-", *CAMERA, "--out", "-") == 0
     shown = capfdbinary.readouterr()
+    assert b"not delivered by the source" not in shown.err  # frames of a pipe are as late as the pipe
     frames = np.frombuffer(shown.out, np.uint8).reshape(-1, SIZE, SIZE, 3) / 255
     assert len(frames) == COUNT
     assert decibel(frames[-1].mean(-1), crop(SCENE)) > 30
     assert f"{COUNT} frames in".encode() in shown.err
+
+
+def test_a_file_that_is_no_video_on_standard_input_is_refused_in_one_line(tmp_path, capfd):
+    (tmp_path / "text").write_text("no video " * 100)
+    with on_standard_input(tmp_path / "text"):
+        message = refused(capfd, "live", "-", *CAMERA)
+    assert "standard input is not a video that can be read from a pipe: send Matroska" in message
 
 
 @pytest.mark.parametrize(

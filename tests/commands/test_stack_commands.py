@@ -68,6 +68,18 @@ def test_run_of_a_long_stack(place, tmp_path, capsys):
     assert 1 < gain["lowest"] <= gain["highest"] < 40
 
 
+@pytest.mark.parametrize("bands", [2, 5])
+def test_files_of_any_number_of_bands(place, tmp_path, bands):
+    grey = tifffile.imread(place / "frames.tif")[:4]
+    np.save(tmp_path / "bands.npy", np.stack([grey] * bands, 1))
+    more = ("--config", place / "camera.toml", "--full-scale", 4095)
+    assert rsvib("run", tmp_path / "bands.npy", tmp_path / "out", *more, "--output", "restored.npy") == 0
+    assert read_stack_info(tmp_path / "out" / "restored.npy").shape == (4, bands, *grey.shape[1:])
+    assert read_manifest(tmp_path / "out" / "manifest.json").totals()["restored"] == 1
+    assert rsvib("detect", tmp_path / "bands.npy", "--out", tmp_path / "found", *more) == 0
+    assert rsvib("motion", tmp_path / "bands.npy", "--out", tmp_path / "motion.csv", *more, "--search", 6) == 0
+
+
 def test_files_that_are_no_vibration_are_refused(place, tmp_path, capsys):
     expected = "expected format 'rsvib vibration' of version 1"
     for vibration, message in (("manifest.json", expected), ("windows.png", "not a file of DetectionResult.save")):

@@ -2,6 +2,7 @@
 
 import csv
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from detections import detection_of, result_of
 from refusals import refuses
 
 import rsvib_torch as rsv
+from rsvib_torch.results.reason import Reason
 from rsvib_torch.stacks.manifest import StackManifest
 from rsvib_torch.stacks.windows import WindowRecord
 
@@ -104,6 +106,16 @@ def test_a_table_without_tones_has_no_explanation_of_its_columns():
     assert manifest_of(window(0, None), window(1, None)).lines()[0] == [
         "axis  reliable windows  amplitude (px)  frequency (Hz)\nx     0 of 2\ny     0 of 2"
     ]
+
+
+def test_the_answer_about_a_camera_at_rest_is_one_sentence():
+    still = [replace(window(0, TWO_TONES), detection=None, window=n) for n in range(2)]
+    findings = tuple((Reason("no_tone", axis),) for axis in "xy")
+    at_rest = replace(detection_of(TWO_TONES), findings=findings)
+    vibration, restoration = manifest_of(*(replace(one, detection=at_rest) for one in still)).lines()
+    assert len(vibration) == 1
+    assert vibration[0].startswith("no window has a significant tone: the camera stands still")
+    assert restoration == ["0 of 2 windows restored"]
 
 
 def test_pandas_frame_is_the_table():
