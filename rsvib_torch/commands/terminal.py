@@ -1,7 +1,9 @@
 """Terminal output: progress, the answer of a command as text or JSON, and warnings and errors in one line each."""
 
+import os
 import re
 import shlex
+import sys
 import textwrap
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -64,7 +66,13 @@ def current_output() -> Output:
 
 def print_line(message: str) -> None:
     """Print a text to standard output; long lines are not wrapped, and control codes are escaped."""
-    typer.echo(printable(message, lines=True))
+    try:
+        typer.echo(printable(message, lines=True))
+    except OSError as error:  # as of a pipe whose reader has ended, after which typer exits without a message
+        # what is left in the buffer would fail again at the exit
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        problem = f"the answer cannot be written to standard output ({error.strerror})"
+        raise OSError(f"{problem}; the files are complete") from error
 
 
 def show_answer(command: str, answer: Answer) -> None:

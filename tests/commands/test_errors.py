@@ -2,6 +2,8 @@
 
 import json
 import os
+import subprocess
+import sys
 import warnings
 
 import pytest
@@ -106,3 +108,15 @@ def test_links_without_target_are_not_replaced_and_names_are_shown_as_they_are(t
         check_new([tmp_path / "out.tif"], overwrite=False, inputs=[])
     with running(["a\u202eb\x1b.tif"]):
         assert current_output().command == r"rsvib 'a\u202eb\x1b.tif'"
+
+
+def test_an_answer_whose_reader_has_ended_is_an_error_in_one_line():
+    reader, writer = os.pipe()
+    os.close(reader)
+    try:
+        command = [sys.executable, "-m", "rsvib_torch", "cameras", "iphone"]
+        done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
+    finally:
+        os.close(writer)
+    message = "the answer cannot be written to standard output (Broken pipe); the files are complete"
+    assert (done.returncode, done.stderr) == (2, f"rsvib: error: {message}\n")
