@@ -60,8 +60,8 @@ def live_session(given: LiveOptions) -> Answer:
     restoration = {name: value for name, value in settings.restoration.items() if name in available}
     source: video.CameraSource | video.FileSource
     if camera:
-        number = video.STANDARD_INPUT if given.source == "-" else given.source
-        source = video.CameraSource(int(number) if number.isdecimal() else number, settings.timing, given.full_scale)
+        number = int(given.source) if given.source.isdecimal() else given.source
+        source = video.CameraSource(number, settings.timing, given.full_scale)
     else:
         source = video.FileSource(Path(given.source), settings.timing, given.full_scale or settings.full_scale)
     with _frames_on_standard_output(enabled=str(given.out) == "-") as stream:
@@ -78,7 +78,7 @@ def live_session(given: LiveOptions) -> Answer:
         )
         report = video.run_live(source, tracker, outputs)
     if report.frames == 0:
-        raise ValueError(video.NOT_A_VIDEO if given.source == "-" else f"{given.source}: no frame was read")
+        raise ValueError(f"{given.source}: no frame was read")
     slow = "dropped, because processing was too slow (fewer --columns)"
     missing = {slow: report.dropped, "not delivered by the source": report.lost}
     parts = [f"{number_of(count, 'frame')} {why}" for why, count in missing.items() if count]

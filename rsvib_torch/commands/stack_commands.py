@@ -44,11 +44,6 @@ class DetectCommand(shared.StackCommand, shared.PixelSizeOptions, shared.Verdict
     """Folder for vibration.json, tables (tones, offsets, spectrum) and figures."""
 
 
-def _channels(pixels: Tensor) -> Table:
-    """The option that states the axis of the channels of a file, of which there may be any number."""
-    return {"channels": "first"} if pixels.ndim == 4 else {}
-
-
 def detect(given: DetectCommand) -> Answer:
     """Detect the vibration in a stack of frames.
 
@@ -59,7 +54,7 @@ def detect(given: DetectCommand) -> Answer:
     answers.check_folder(out, answers.OF_DETECTION, given.overwrite, given.inputs)
     pixels, timing = load(given)
     with working("detecting the vibration"):
-        result = detection.detect_vibration(pixels, timing, **_channels(pixels) | settings.detection)
+        result = detection.detect_vibration(pixels, timing, channels=io.channels_of(pixels), **settings.detection)
     with whole(out, "folder") as folder:
         names = answers.write_detection(folder, result, timing, given.pixel_size)
     answer = answers.stack_answer(frames, result, given.pixel_size)
@@ -87,7 +82,7 @@ def motion(given: MotionCommand) -> Answer:
     shared.check_file(out, given.overwrite, given.inputs)
     pixels, timing = load(given)
     with working("detecting the motion"):
-        result = detection.detect_motion(pixels, timing, **_channels(pixels) | given.detection)
+        result = detection.detect_motion(pixels, timing, channels=io.channels_of(pixels), **given.detection)
     columns = reports.motion_columns(result, timing)
     reports.write_columns(out, columns)
     known_motion = ("--motion", out, "--unit", "px", "--offset", "0")

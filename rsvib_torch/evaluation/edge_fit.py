@@ -13,7 +13,7 @@ from rsvib_torch.numerics.tables import Array
 # Parameters of an edge: polynomial of the line (4), logarithm of the blur in px, dark and bright side (3 each)
 BLUR, DARK, BRIGHT, PARAMETERS = 4, 5, 8, 11
 ACROSS = [DARK + 1, BRIGHT + 1]  # slopes of the two sides across the edge
-_BLUR_LIMITS = np.log([0.05, 60.0])  # of log px
+_BLUR_LIMITS = np.log([0.05, 60.0])  # logarithms of px; a pixel hides less blur, and a ROI does not contain more
 
 
 def gaussian_edge(distance: Array, sigma: float, width: float) -> tuple[Array, Array, Array]:

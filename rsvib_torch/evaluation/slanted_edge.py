@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
-from scipy.special import sici
+from scipy.special import sici, softmax
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import ArrayLike, as_tensor, checks_arguments
@@ -166,7 +166,7 @@ def slanted_edge_mtf(roi: ArrayLike) -> MtfCurve:
     edge = fit_edge(values)
     edge, noise, position, posteriors = _fit_spread(edge, room=check_edge(edge, limits))
     gaussian = gaussian_edge(position, edge.sigma, edge.pixel)[1]
-    weights = _weights(posteriors)
+    weights = softmax([one.evidence for one in posteriors])  # of the priors
     spreads = np.stack([gaussian + one.lsf @ one.shape for one in posteriors])
     lsf = weights @ spreads
     # 2. MTF with its standard deviation: within the priors, and between them.
@@ -251,13 +251,6 @@ class _Posterior(NamedTuple):
     shape: Array  # (2 + K,) step of the logarithm of the blur, and heights of tail and bumps
     root: Array  # (2 + K, S) square root of their covariance
     lsf: Array  # (N, 2 + K) derivatives of the line spread function by them
-
-
-def _weights(posteriors: list[_Posterior]) -> Array:
-    """Weights of the priors, whose sum is 1."""
-    evidence = np.array([one.evidence for one in posteriors])
-    weights = np.exp(evidence - evidence.max())
-    return weights / weights.sum()
 
 
 def _ramps(frequency: Array, position: Array) -> Array:
@@ -361,7 +354,7 @@ def _fit_spread(edge: Edge, room: float) -> tuple[Edge, float, Array, list[_Post
             posteriors += _posteriors(matrix / noise**2, right / noise**2, lsf, bumps.fades(scale), edge.contrast)
         best = max(one.evidence for one in posteriors)
         posteriors = [one for one in posteriors if one.evidence > best + math.log(_LEAST_WEIGHT)]
-        weights = _weights(posteriors)
+        weights = softmax([one.evidence for one in posteriors])
         # 4. Move edge and sides, and narrow or widen the Gaussian blur.
         departure = weights @ np.stack([one.lsf @ one.shape for one in posteriors])
         step = weights @ np.stack([one.edge for one in posteriors])

@@ -49,7 +49,9 @@ def frames_from_row_order(frames: Tensor, timing: SensorTiming) -> Tensor:
 def offsets_from_row_order(offsets: Tensor, timing: SensorTiming) -> Tensor:
     """Turn displacements or offsets (..., A) in row order back to image axes (x, y) and, if A > 2, roll and zoom."""
     _, signs = row_axes(timing, offsets.shape[-1])
-    return magnitudes_from_row_order(offsets * offsets.new_tensor(signs), timing)
+    if min(signs) < 0:  # a tensor of signs is a transfer to the GPU
+        offsets = offsets * offsets.new_tensor(signs)
+    return magnitudes_from_row_order(offsets, timing)
 
 
 def magnitudes_from_row_order(values: Tensor, timing: SensorTiming, axis: int = -1) -> Tensor:
@@ -63,6 +65,8 @@ def magnitudes_from_row_order(values: Tensor, timing: SensorTiming, axis: int = 
         [[2.0, 1.0, 3.0]]
     """
     order, _ = row_axes(timing, values.shape[axis])
+    if order == sorted(order):  # a tensor of places is a transfer to the GPU
+        return values
     return values.index_select(axis, torch.tensor(order, device=values.device))
 
 
@@ -252,7 +256,8 @@ def as_float_frames(
     axis = channel_axis(name, frames.shape, channels)
     count = frames.shape[1 if frames.ndim == 5 else 0]
     if count < minimum_frames:
-        images = f" of {frames.shape[axis]} channels; grey frames are (T, H, W), in TIFF pages" * (frames.ndim == 4)
+        grey = f" of {frames.shape[axis]} channels; grey frames are (T, H, W), in TIFF pages"
+        images = grey if frames.ndim == 4 else ""
         raise ValueError(f"at least {minimum_frames} frames are needed, got {count}{images}")
     if min(frames.shape) == 0:
         raise ValueError(f"{name} must not be empty, got shape {tuple(frames.shape)}")

@@ -8,6 +8,7 @@ from .stack_info import H264 as H264
 from .stack_info import StackInfo as StackInfo
 from .stack_info import is_video as is_video
 from .stack_info import split_range as split_range
+from .stack_reading import channels_of as channels_of
 from .stack_reading import open_stack as open_stack
 from .stack_reading import read_frames as read_frames
 from .stack_reading import read_stack as read_stack

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks.arguments import PathLike, checks_arguments
+from rsvib_torch.checks.arguments import Channels, PathLike, checks_arguments
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.files.reading import check_fits
 from rsvib_torch.frames.entry_points import LoadedFrames
@@ -63,6 +63,11 @@ def read_stack_info(path: PathLike) -> StackInfo:
     """
     with closing(open_stack(path)) as reader:
         return reader.info
+
+
+def channels_of(frames: Tensor) -> Channels:
+    """The option ``channels`` of frames as ``read_stack`` returns them: files have any number of channels."""
+    return "first" if frames.ndim == 4 else None
 
 
 @checks_arguments

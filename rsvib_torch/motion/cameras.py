@@ -169,7 +169,8 @@ def camera_mode(name: str, *, width: int, height: int, frame_rate: float) -> Cam
             f"{rate:.4g}/s: {known}; {other}measure the row time (rsvib calibrate). Scaled frames take the readout "
             "time of their mode: row_time is this time / their rows"
         )
-    if len(names := dict.fromkeys(mode.name for mode in fitting)) > 1:
+    names = dict.fromkeys(mode.name for mode in fitting)
+    if len(names) > 1:
         raise ValueError(f"several modes fit, give the complete name: {', '.join(names)}")
     mode = min(fitting, key=lambda mode: abs(mode.frame_rate - rate))
     return replace(mode, width=width, height=height, frame_rate=rate)

@@ -141,24 +141,29 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
     def lines(self) -> tuple[list[str], list[str]]:
         """The totals as lines of text: about the vibration, and about the restoration."""
         data = self.totals()
-        vibration = self._tone_lines(data["tones"]) if self.gyroscope is None else _gyroscope_lines(self.gyroscope)
-        found = [record.detection for record in self.windows]
-        if "video" not in self.settings and all(
-            one is not None and {reason.code for of_axis in one.findings for reason in of_axis} == {"no_tone"}
-            for one in found
-        ):
+        # All windows were measured, and nothing else than missing tones is stated against any axis.
+        is_video = "video" in self.settings  # a hand may move its camera
+        is_still = (
+            bool(self.windows)
+            and not is_video
+            and all(
+                record.detection is not None
+                and {reason.code for of_axis in record.detection.findings for reason in of_axis} == {"no_tone"}
+                for record in self.windows
+            )
+        )
+        if is_still:
             text = "the camera stands still, or moves uniformly or by less than the noise"
-            return [wrapped(f"no window has a significant tone: {text}")], [
-                f"0 of {number_of(len(found), 'window')} restored",
-                *self.losses,
-            ]
-        if "video" in self.settings:
+            vibration = [wrapped(f"no window has a significant tone: {text}")]
+        else:
+            vibration = self._tone_lines(data["tones"]) if self.gyroscope is None else _gyroscope_lines(self.gyroscope)
+        if is_video:
             vibration += self._lines_of_video()
         restoration = [f"{data['restored']} of {number_of(data['windows'], 'window')} restored"]
         if data["predicted_gain_db"] is not None:
             gains = dict.fromkeys(f"{gain:+.1f}" for gain in data["predicted_gain_db"].values())
             restoration.append(f"estimated improvement {' … '.join(gains)} dB")
-        for name, notes in data["left_alone"].items():
+        for name, notes in data["left_alone"].items() if not is_still else ():
             texts = {window: note["text"] for window, note in notes.items()}
             restoration += [wrapped(f"{name} unchanged in {text}") for text in _first_of(texts)]
         return vibration, restoration + self.losses

@@ -60,7 +60,7 @@ def memory_needed(
         pixel_bytes = min(_PIXEL_BYTES.values())
     else:
         pixel_bytes = _PIXEL_BYTES.get(restoration.get("method", "exact"), max(_PIXEL_BYTES.values()))
-        pixel_bytes += PRIOR_BYTES * (restoration.get("prior", "gaussian") != "gaussian")
+        pixel_bytes += 0 if restoration.get("prior", "gaussian") == "gaussian" else PRIOR_BYTES
     mosaic = restoration is not None and restoration.get("mosaic") is not None and not on_gpu
     if mosaic or (restoration is not None and restoration.get("scale", 1) != 1):  # mosaics are solved on the finer grid
         pixel_bytes *= _FINER

@@ -276,7 +276,8 @@ class StackReport(Summarised):
         if self.resumed:
             lines.append(f"windows complete before this run: {self.resumed}")
         lost = [(self.failed, "window", "failed"), (self.bad_frames, "frame", "could not be used")]
-        if texts := [f"{number_of(count, what)} {why}" for count, what, why in lost if count]:
+        texts = [f"{number_of(count, what)} {why}" for count, what, why in lost if count]
+        if texts:
             lines.append(f"{', '.join(texts)}: see {self.manifest.name}")
         return "\n".join(lines)
 

@@ -12,12 +12,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks.arguments import Channels, check_pixels
+from rsvib_torch.checks.arguments import check_pixels
 from rsvib_torch.detection import MotionDetection, detect_motion, detect_vibration
 from rsvib_torch.detection.shapes.free import vibration_in_place_of
 from rsvib_torch.frames.full_scale import counts_to_frames
 from rsvib_torch.frames.prepare import constant_frame, is_constant, prepare_frames
 from rsvib_torch.imaging.sensor_model import sharpened
+from rsvib_torch.io.stack_reading import channels_of
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
@@ -77,7 +78,7 @@ def measured_motion(frames: Tensor, timing: SensorTiming, options: Mapping[str, 
     If the frames agree with a lost one, its time is taken into account. Without options, a motion of any shape is
     measured if the tones may change, and taken if more axes are reliable.
     """
-    channels: Channels = "first" if frames.ndim == 4 else None  # of files, of any number
+    channels = channels_of(frames)
     detected = detect_vibration(frames, timing, channels=channels, **options)
     lost = next((one.details["after"] for one in detected.findings[0] if one.code == "other_frame_times"), None)
     if isinstance(lost, int):
@@ -191,7 +192,7 @@ def restore_trusted(
         vibration, left_alone = vibration_to_undo(motion, timing)
     frames = frames if first_frames is None else frames[:first_frames]
     joint, scale, optics = options.joint, options.scale, check_optics(options.optics)
-    channels: Channels = "first" if frames.ndim == 4 else None
+    channels = channels_of(frames)
     prepared = prepare_frames(frames, timing, channels=channels, saturation=options.saturation, mosaic=options.mosaic)
     lost = prepared.lost_rows()
     if not bool(vibration.moving_axes().any()):

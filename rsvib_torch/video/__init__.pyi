@@ -1,7 +1,5 @@
 from .process_video import process_video
 from .session import (
-    NOT_A_VIDEO,
-    STANDARD_INPUT,
     CameraSource,
     FileSource,
     FrameOutput,
@@ -15,8 +13,6 @@ from .session import (
 from .steadying import Margins
 
 __all__ = [
-    "NOT_A_VIDEO",
-    "STANDARD_INPUT",
     "CameraSource",
     "FileSource",
     "FrameOutput",

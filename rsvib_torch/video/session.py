@@ -42,11 +42,6 @@ if TYPE_CHECKING:
 
 Frame = NDArray[np.uint8]  # (H, W) grey or (H, W, 3) RGB
 
-STANDARD_INPUT = "pipe:0"  # the name of FFmpeg
-NOT_A_VIDEO = (
-    "standard input is not a video that can be read from a pipe: send Matroska, MPEG-TS or fragmented MP4, or give the "
-    "name of the file"
-)
 _CHECK = 0.05  # s between checks whether the source has ended, or the session
 _LONGEST_READ = 2.0  # s that the end of a session waits for a frame of the source; OpenCV waits 30 s for a camera
 # of FFmpeg: every frame is written when it is encoded, in a fragment (.mp4, .mov, .m4v) or cluster (.mkv) of its own.
@@ -117,7 +112,7 @@ class FrameCounter:
 
 
 class CameraSource:
-    """A camera of OpenCV, by its number or URL; frames are RGB with 8 bits. ``pipe:0`` is a video on standard input."""
+    """A camera of OpenCV, by its number or URL, or ``"-"``, a video on standard input; frames are RGB with 8 bits."""
 
     def __init__(self, camera: int | str, timing: SensorTiming, full_scale: float | None = None) -> None:
         self._camera, self._period, self.lost, self.waits = camera, timing.frame_period, 0, False
@@ -125,30 +120,35 @@ class CameraSource:
 
     def frames(self) -> Iterator[TimedFrame]:
         """The frames; times are whole frame periods apart."""
+        is_pipe = self._camera == "-"
+        problem = (
+            "standard input is not a video that can be read from a pipe: send Matroska, MPEG-TS or fragmented MP4, or "
+            "give the name of the file"
+            if is_pipe
+            else f"camera {self._camera} cannot be opened; check its number or URL, and whether it is in use"
+        )
         level = cv2.utils.logging.getLogLevel()
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # only the error below is shown
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
         try:
-            capture = cv2.VideoCapture(self._camera)
+            capture = cv2.VideoCapture("pipe:0" if is_pipe else self._camera)
         finally:
             cv2.utils.logging.setLogLevel(level)
         if not capture.isOpened():
-            raise OSError(
-                NOT_A_VIDEO
-                if self._camera == STANDARD_INPUT
-                else f"camera {self._camera} cannot be opened; check its number or URL, and whether it is in use"
-            )
+            raise OSError(problem)
         counter, before = FrameCounter(self._period), -1
         try:
             while (answer := capture.read())[0]:
                 pixels, now = answer[1], time.perf_counter()
                 # a pipe may be slower than the camera, and delivers every frame
                 stamp = 1e-3 * capture.get(cv2.CAP_PROP_POS_MSEC)
-                number = before + 1 if self._camera == STANDARD_INPUT else counter.number(now, stamp)
+                number = before + 1 if is_pipe else counter.number(now, stamp)
                 self.lost, before = self.lost + number - before - 1, number
                 if pixels.ndim == 3:
                     pixels = np.ascontiguousarray(np.moveaxis(pixels[..., ::-1], -1, 0))
                 yield TimedFrame(pixels, number * self._period, now)
+            if is_pipe and before < 0:  # an MP4 whose table is at its end can be opened
+                raise OSError(problem)
         finally:
             capture.release()
 

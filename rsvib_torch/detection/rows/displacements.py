@@ -376,8 +376,8 @@ _SCATTER_ROWS = 32  # px, rows whose errors of interpolation count as one
 # were right behind exposures with paths of 1 to 8 px), and that of the difference over the detail
 _OF_RATIO, _OF_DETAIL = 0.1, 0.0007
 _LOWEST, _HIGHEST = 1 / 64, 0.15  # cycles/px; shading lies below, and a blur of 2 px is expanded to 20 % above
-# px^2, second moment of a path beyond which the second order says nothing: right stacks with exposures stated 0.5 to
-# 2 times the true one have up to 2.5; with 29, a right ratio was measured as 0.16 +- 0.06
+# px^2, second moment of a path beyond which the second order is not an approximation: right stacks with exposures
+# stated 0.5 to 2 times the true one have up to 2.5; with 29, a right ratio was measured as 0.16 +- 0.06
 _LARGEST_MOMENT = 8.0
 
 
