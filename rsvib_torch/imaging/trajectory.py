@@ -80,19 +80,20 @@ def rows_showing(
     in s broadcasts to S.
     """
     check_two_axes(vibration, "the displacement of a row")
-    scene_rows = scene_rows.to(torch.float64)
-    rows = scene_rows + torch.zeros_like(frame_start)
+    scene_rows, frame_start = scene_rows.to(torch.float64)[..., None], frame_start[..., None]
+    rows, known_slope = scene_rows + torch.zeros_like(frame_start), None
     near = torch.tensor([-1e-3, 0.0, 1e-3], dtype=torch.float64, device=rows.device)  # rows, for the derivative
-    for iteration in range(8):
-        starts = frame_start[..., None] + (rows[..., None] + near) * timing.row_time
-        before, displacement, after = vibration.mean_displacement(starts, timing.exposure_time).unbind(-2)
-        slope = (after - before) / 2e-3
+    for _ in range(8):
+        of_near = vibration.mean_displacement(frame_start + (rows + near) * timing.row_time, timing.exposure_time)
+        displacement, slope = of_near[..., 1, :], (of_near[..., 2, :] - of_near[..., 0, :]) / 2e-3
         # the limit keeps steps finite near slope 1
-        step = (scene_rows + displacement[..., 1] - rows) / (1.0 - slope[..., 1].detach()).clamp(min=0.1)
-        rows, displacement = rows + step, displacement + slope * step[..., None]
-        # a step of 1e-3 px would be followed by less than its square, far below any measurement
-        if iteration > 0 and bool((step.abs() < 1e-3).all()):
+        step = (scene_rows + displacement[..., 1:] - rows) / (1.0 - slope[..., 1:].detach()).clamp(min=0.1)
+        rows, displacement = rows + step, displacement + slope * step
+        # px, what the next step would change is less than half of the change of the slope times this step
+        if known_slope is not None and bool(((slope - known_slope) * step).abs().amax() < 2e-5):
             break
+        known_slope = slope
+    rows = rows[..., 0]
     return rows, displacement
 
 
