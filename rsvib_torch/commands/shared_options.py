@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from rsvib_torch import gyroscope, io, stacks
+from rsvib_torch import gyroscope, io, stacks, video
 from rsvib_torch.checks.values import options
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.terminal import note, working
@@ -214,13 +214,15 @@ class RestoringCommand(StackCommand):
         device = str(self.torch_device)
         return self.processing | {"full_scale": self.scale, "restoration": self._chosen(), "device": device}
 
-    def process(self, restored: Path, of_run: Table) -> "stacks.StackReport":
-        """Process the stack in windows, with the options of the command and those of the run."""
-        of_run = Table(window=self.window, force=self.force) | self.of_stack | of_run
-        counts = self.info.shape[0] > of_run["window"]
+    def process(self, restored: Path, of_run: Table, *, followed: bool = False) -> "stacks.StackReport":
+        """Process the stack in windows, or frame by frame, with the options of the command and those of the run."""
+        of_windows = Table() if followed else Table(window=self.window, force=self.force)
+        of_run = of_windows | self.of_stack | of_run
+        counts = followed or self.info.shape[0] > of_run["window"]
+        run = video.process_video if followed else stacks.process_stack
         with working(f"restoring {self.frames.name}", counts=counts) as progress:
             of_run["progress"] = progress if counts else None
-            report = stacks.process_stack(self.frames, restored, self.settings.timing, **of_run)
+            report = run(self.frames, restored, self.settings.timing, **of_run)
         if report.not_kept:
             note(f"{restored}: not kept from the input: {', '.join(report.not_kept)}")
         return report

@@ -148,7 +148,7 @@ def restore(given: RestoreCommand) -> Answer:
         detected = reports.read_vibration(vibration, io.timing_from_first_frame(settings.timing, info))
         given.print_notes()
         of_run |= {"given": [detected], "window": max(2, info.shape[0])}
-        answer = Answer({"Vibration": [detected.summary()]}, {"detection": answers.detection_data(detected)})
+        answer = Answer({"Vibration": [detected.summary()]}, {"detection": answers.without_curves(detected)})
     elif given.motion is not None and vibration is None:
         answer = Answer({}, {"alignment": None})
         of_run["motion"] = _motion_of_frames(given, given.motion, replace(info, full_scale=given.scale), answer)
@@ -156,7 +156,9 @@ def restore(given: RestoreCommand) -> Answer:
         raise ValueError("give --vibration FILE, or --motion FILE of a recording")
     # 2. Restoration in windows.
     run = given.process(given.restored, of_run)
-    answer.results["Restoration"], answer.data["restoration"] = answers.restoration_of(run)
+    stored = stacks.read_manifest(run.manifest)
+    answer.results["Restoration"] = answers.restoration_lines(run, stored)
+    answer.data["restoration"] = stored.totals()
     answer.files += [given.restored, given.manifest]
     return answer
 

@@ -30,6 +30,7 @@ from rsvib_torch.options import (
     VibrationOptions,
 )
 from rsvib_torch.restoration.restore import check_optics
+from rsvib_torch.results.presentation import plain_values
 from rsvib_torch.stacks.memory import windows_at_once
 from rsvib_torch.stacks.window_restoration import (
     WindowMotion,
@@ -90,10 +91,17 @@ class StackJob:
         kept = tuple(index for index in images if index in window.written)
         none = torch.empty((0, *self.info.shape[1:]), dtype=torch.float32, device="cpu")
         taken = (torch.stack(list(images.values())) if images else none).to(options.device)
-        bad = {index: fault for index, fault in faults.items() if index in window.written}
-        result = WindowResult(window, kept, self._unchanged(taken[: len(kept)]), None, None, None, bad)
+        record = WindowRecord(
+            window.index,
+            window.first,
+            window.last,
+            start_time=float(self.timing.frame_starts(window.first + 1)[-1]),
+            written=1 if self.is_joined else window.kept,
+            bad_frames={str(index): fault for index, fault in faults.items() if index in window.written},
+        )
+        result = WindowResult(record, kept, self._unchanged(taken[: len(kept)]))
         if faults and len(images) < 2:
-            return replace(result, error=next(iter(faults.values())))
+            return result.stating(error=next(iter(faults.values())))
         timing = window_timing(self.timing, window, list(images))
         try:
             # 2. Their motion.
@@ -102,12 +110,15 @@ class StackJob:
             else:
                 given = self.given[window.index]
                 if given is None:
-                    return replace(result, error="no detection was given for this window")
+                    return result.stating(error="no detection was given for this window")
                 moved = WindowMotion(given, given if isinstance(given, DetectedVibration) else None, timing)
-            lost_before = None if moved.lost_before is None else window.first + moved.lost_before
-            result = replace(result, detection=moved.tones, motion=moved.free, lost_before=lost_before)
+            result = replace(result, detection=moved.tones).stating(
+                detection=None if moved.tones is None else DetectedVibration.of(moved.tones).to("cpu"),
+                motion=None if moved.free is None else moved.free.to("cpu"),
+                lost_before=None if moved.lost_before is None else window.first + moved.lost_before,
+            )
             # 3. The frames without it, and whether they are better.
-            restoration = restore_trusted(
+            done = restore_trusted(
                 taken,
                 moved.timing,
                 moved.motion,
@@ -117,17 +128,25 @@ class StackJob:
                 most_pairs=8 if window.alone else 2,  # limits the time of the verdict
             )
         except (ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
-            return replace(result, error=" ".join(str(error).split()))
-        result = replace(result, restoration=restoration)
-        if not restoration.restored:
+            return result.stating(error=" ".join(str(error).split()))
+        result = result.stating(
+            left_alone=done.left_alone,
+            lost_rows={str(index): done.lost_rows[at] for at, index in enumerate(kept) if at in done.lost_rows},
+        )
+        if (verdict := done.verdict) is not None:
+            gain = plain_values(verdict.predicted_gain.nanmean())
+            result = result.stating(outcome=verdict.overall, verdict=verdict.sentence, predicted_gain=gain)
+        elif done.restored:
+            unknown = "cannot determine whether restoration helps: no two frames show the same scene"
+            result = result.stating(verdict=unknown)
+        if not done.restored:
             return result
         # 4. Those that are written, or one image of all.
-        frames = restoration.frames
-        if self.is_joined:
-            result = replace(result, indices=())
-        else:
+        frames, indices = done.frames, kept[: 0 if self.is_joined else None]
+        if not self.is_joined:
             taken, frames = taken[: len(kept)], frames[: len(kept)]
-        return replace(result, frames=frames if self.info.nodata is None else without_data(frames, taken))
+        frames = frames if self.info.nodata is None else without_data(frames, taken)
+        return replace(result, indices=indices, frames=frames).stating(frames="restored")
 
     def compute_stored(self, window: Window, pixels: WindowFrames) -> tuple[WindowRecord, Array, WindowResult | None]:
         """The record of a window, its frames as the file has them, and the result of the first window of the stack.
@@ -155,8 +174,8 @@ class StackJob:
             middle = window.written[window.kept // 2]
             written = [middle] if self.is_joined else window.written
             frames = [counts(restored[index]) if index in restored else as_taken(index) for index in written]
-        record, first = WindowRecord.of(result, self.timing, len(frames)), result if window.index == 0 else None
-        return record, np.ascontiguousarray(np.stack(frames)), first  # channels may be stored last
+        stored = np.ascontiguousarray(np.stack(frames))  # channels may be stored last
+        return result.record, stored, result if window.index == 0 else None
 
     def _unchanged(self, frames: Tensor) -> Tensor:
         """Frames that were not restored, in the shape of restored ones."""
