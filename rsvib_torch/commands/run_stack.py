@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import rsvib_torch
 from rsvib_torch import detection, io, stacks, video
@@ -20,6 +20,9 @@ from rsvib_torch.files.atomic import whole
 from rsvib_torch.files.reading import Table
 from rsvib_torch.options import ProcessVideoOptions, StackOptions
 from rsvib_torch.text import printable
+
+if TYPE_CHECKING:
+    from rsvib_torch.motion.detected_vibration import DetectedVibration
 
 _RESULTS = (*answers.OF_DETECTION, *answers.OF_WINDOWS, "before_after.png", "report.html")
 
@@ -94,7 +97,7 @@ def run(given: RunCommand) -> Answer:
     result = given.process(restored, of_run | {"manifest": out / "manifest.json"}, followed=given.is_followed)
     stored = stacks.read_manifest(result.manifest)
     # 2. Tables and figures of one vibration of all frames, or of the windows; the page.
-    page = _page(given, stored, None if given.is_followed else result.first or _first_window(given))
+    page = _page(given, stored, None if given.is_followed else result.detection or _first_detection(given))
     found = page.detection if page.windows is None else None
     answer = _answer(given, found, stored)
     answer.results["Restoration"] = answers.restoration_lines(result, stored)
@@ -122,24 +125,24 @@ def run(given: RunCommand) -> Answer:
     return answer
 
 
-def _first_window(given: RunCommand) -> stacks.WindowResult:
-    """The result of the first window of a run that was complete before."""
+def _first_detection(given: RunCommand) -> DetectedVibration | None:
+    """The detection in the first window of a run that was complete before."""
     of_run = given.of_stack | {"detection": given.settings.detection, "window": given.window, "force": given.force}
     of_windows = {name: value for name, value in of_run.items() if name in fields_of(StackOptions)}
-    return next(iter(stacks.iterate_stack(given.frames, given.settings.timing, **of_windows)))
+    return stacks.first_detection(given.frames, given.settings.timing, StackOptions(**of_windows))
 
 
-def _page(given: RunCommand, stored: stacks.StackManifest, first: stacks.WindowResult | None) -> reports.Report:
+def _page(given: RunCommand, stored: stacks.StackManifest, found: DetectedVibration | None) -> reports.Report:
     """The page of a run: usable frames of the first window, of a video two neighbours; without a page, one frame."""
     # 1. The frames that are shown; of an image that was restored jointly from all, the middle one of the input.
     record, bad, joint = stored.windows[0], stored.bad_frames, given.of_stack["restoration"].get("joint") is True
     shown = [number for number in range(record.last + 1) if str(number) not in bad]
-    if first is None:  # earlier frames must be decoded as well
+    if given.is_followed:  # earlier frames must be decoded as well
         start = min((n for n in shown if n + 1 in shown), key=lambda number: abs(number - 8), default=record.last + 1)
         shown = [number for number in shown if start <= number <= start + 1]
     elif not joint:
         shown = [number for number in shown if number < record.written]
-    if first is not None and not given.report:
+    if not given.is_followed and not given.report:
         middle = len(shown) // 2 if joint else 0
         shown = shown[middle : middle + 1]
     # 2. Their pixels as taken and as written.
@@ -156,7 +159,7 @@ def _page(given: RunCommand, stored: stacks.StackManifest, first: stacks.WindowR
         scale = None if io.is_video(given.restored) else given.scale
         after = io.read_frames(given.restored, [0] if joint else shown, scale)
     # 3. What was found in them.
-    detected = first.detection if first is not None and isinstance(first.detection, detection.DetectionResult) else None
+    detected = found if isinstance(found, detection.DetectionResult) else None  # of a steady vibration
     alone = detected is not None and len(stored.windows) == 1
     timing = io.timing_from_first_frame(given.settings.timing, given.info)
     return reports.Report(

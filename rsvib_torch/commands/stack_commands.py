@@ -29,11 +29,12 @@ def load(given: shared.StackCommand) -> tuple[Tensor, rsvib_torch.SensorTiming]:
 
     The frames are (T, H, W) or (T, C, H, W), full scale 1; the timing has the frame times of the file.
     """
-    stacks.check_stack_fits(given.info, on_gpu=given.torch_device.type != "cpu")
+    device = stacks.chosen_device(given.device)
+    stacks.check_stack_fits(given.info, on_gpu=device.type != "cpu")
     with working(f"reading {given.frames}"):
         frames = io.read_stack(given.frames, full_scale=given.scale)
     given.print_notes()
-    return frames.to(given.torch_device), io.timing_from_first_frame(given.settings.timing, given.info)
+    return frames.to(device), io.timing_from_first_frame(given.settings.timing, given.info)
 
 
 @options

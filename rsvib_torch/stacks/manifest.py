@@ -304,7 +304,7 @@ def fingerprint(path: Path) -> Table:
 
 
 # options on which the result depends
-_SETTINGS = tuple(name for name in fields_of(StackOptions) if name not in ("memory", "workers"))
+_SETTINGS = tuple(name for name in fields_of(StackOptions) if name not in ("memory", "workers", "given", "motion"))
 
 
 def manifest_header(job: StackJob, output: str) -> Table:

@@ -1,17 +1,15 @@
-"""Windows: consecutive frames that are processed together, their results, and the records of these on the disk."""
+"""Windows: consecutive frames that are processed together, and the records of their results."""
 
 import itertools
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
-from torch import Tensor
 
 from rsvib_torch.checks.values import check_whole_number
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.results.presentation import Summarised
 from rsvib_torch.results.reason import Reason
 
 
@@ -37,6 +35,11 @@ class Window:
     def written(self) -> range:
         """Indices of the frames that it writes."""
         return range(self.first, self.first + self.kept)
+
+    @property
+    def middle(self) -> int:
+        """Index of the middle one of these, in whose place one image of all frames is written."""
+        return self.written[self.kept // 2]
 
     @property
     def alone(self) -> bool:
@@ -93,32 +96,3 @@ class WindowRecord:
     motion: FreeMotion | None = None  # of a vibration that changes, in place of tones; axes that are not reliable rest
     lost_before: int | None = None  # frame of the stack before which one is lost: from it on, a frame period later
     lost_rows: dict[str, int] = field(default_factory=dict)  # number for each frame of the stack that has some
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class WindowResult(Summarised):
-    """One window of a stack, restored."""
-
-    record: WindowRecord  # what the manifest states of it
-    indices: tuple[int, ...]  # of ``frames`` in the stack; empty if all frames were restored jointly as one image
-    frames: Tensor  # usable ones, with full scale 1, (T, H, W) or (T, C, H, W): restored, or as taken
-    # the complete detection, with the time origin at the window's first frame; as ``record.detection``
-    detection: DetectedVibration | None = None
-
-    def stating(self, **values: object) -> "WindowResult":
-        """The result with other values of its record."""
-        return replace(self, record=replace(self.record, **values))  # type: ignore[arg-type]
-
-    @property
-    def restored(self) -> bool:
-        """Whether the frames are restored."""
-        return self.record.frames == "restored"
-
-    def summary(self) -> str:
-        """Frames of the window, its vibration, and what was restored."""
-        record = self.record
-        state = "restored" if self.restored else "unchanged"
-        lines = [f"window {record.window}, frames {record.first} … {record.last}: {state}"]
-        lines += [] if self.detection is None else [self.detection.summary()]
-        lines += [*map(str, record.left_alone), *filter(None, (record.verdict, record.error))]
-        return "\n".join([*lines, *(f"frame {index}: {fault}" for index, fault in record.bad_frames.items())])
