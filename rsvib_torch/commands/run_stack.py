@@ -97,7 +97,7 @@ def run(given: RunCommand) -> Answer:
     result = given.process(restored, of_run | {"manifest": out / "manifest.json"}, followed=given.is_followed)
     stored = stacks.read_manifest(result.manifest)
     # 2. Tables and figures of one vibration of all frames, or of the windows; the page.
-    page = _page(given, stored, None if given.is_followed else result.detection or _first_detection(given))
+    page = _page(given, stored, result.detection or _first_detection(given, stored))
     found = page.detection if page.windows is None else None
     answer = _answer(given, found, stored)
     answer.results["Restoration"] = answers.restoration_lines(result, stored)
@@ -125,8 +125,10 @@ def run(given: RunCommand) -> Answer:
     return answer
 
 
-def _first_detection(given: RunCommand) -> DetectedVibration | None:
-    """The detection in the first window of a run that was complete before."""
+def _first_detection(given: RunCommand, stored: stacks.StackManifest) -> DetectedVibration | None:
+    """The detection in the first window of a run that was complete before, if it is shown."""
+    if stored.is_removed or stored.windows[0].detection is None or not (given.report or len(stored.windows) == 1):
+        return None
     of_run = given.of_stack | {"detection": given.settings.detection, "window": given.window, "force": given.force}
     of_windows = {name: value for name, value in of_run.items() if name in fields_of(StackOptions)}
     return stacks.first_detection(given.frames, given.settings.timing, StackOptions(**of_windows))
@@ -135,7 +137,9 @@ def _first_detection(given: RunCommand) -> DetectedVibration | None:
 def _page(given: RunCommand, stored: stacks.StackManifest, found: DetectedVibration | None) -> reports.Report:
     """The page of a run: usable frames of the first window, of a video two neighbours; without a page, one frame."""
     # 1. The frames that are shown; of an image that was restored jointly from all, the middle one of the input.
-    record, bad, joint = stored.windows[0], stored.bad_frames, given.of_stack["restoration"].get("joint") is True
+    record, bad, restoration = stored.windows[0], stored.bad_frames, given.of_stack["restoration"]
+    joint, mosaic = restoration.get("joint") is True, restoration.get("mosaic")
+    is_restored = any(one.frames == "restored" for one in (stored.windows if given.is_followed else (record,)))
     shown = [number for number in range(record.last + 1) if str(number) not in bad]
     if given.is_followed:  # earlier frames must be decoded as well
         start = min((n for n in shown if n + 1 in shown), key=lambda number: abs(number - 8), default=record.last + 1)
@@ -146,16 +150,12 @@ def _page(given: RunCommand, stored: stacks.StackManifest, found: DetectedVibrat
         middle = len(shown) // 2 if joint else 0
         shown = shown[middle : middle + 1]
     # 2. Their pixels as taken and as written.
-    before, after, mosaic = (
-        io.read_frames(given.frames, shown, given.scale),
-        None,
-        given.of_stack["restoration"].get("mosaic"),
-    )
+    before, after = io.read_frames(given.frames, shown, given.scale), None
     if stored.margins is not None:
         before = video.Margins(**stored.margins).cut(before)
     if mosaic is not None:
         before = preparation.colour_frames(before, mosaic)
-    if len(shown) and record.frames == "restored":
+    if len(shown) and is_restored:
         scale = None if io.is_video(given.restored) else given.scale
         after = io.read_frames(given.restored, [0] if joint else shown, scale)
     # 3. What was found in them.
