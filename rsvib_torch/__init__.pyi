@@ -73,7 +73,6 @@ from .row_time import RowTimeCalibration as RowTimeCalibration
 from .row_time import calibrate_row_time as calibrate_row_time
 from .row_time import calibrate_row_time_by_motion as calibrate_row_time_by_motion
 from .stacks import StackReport as StackReport
-from .stacks import iterate_stack as iterate_stack
 from .stacks import process_stack as process_stack
 from .stacks import read_manifest as read_manifest
 from .tracking import TrackedFrame as TrackedFrame

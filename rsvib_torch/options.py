@@ -310,7 +310,7 @@ class ResourceOptions:
 
 @options
 class StackOptions(WindowOptions, ResourceOptions):
-    """Options of ``iterate_stack``."""
+    """How the windows of a stack are processed."""
 
     detection: OptionTable = None
     """Options of ``detect_vibration``. Without any, ``detect_motion`` measures windows in which no steady vibration
@@ -320,6 +320,11 @@ class StackOptions(WindowOptions, ResourceOptions):
     the level of ``"auto"``. With ``joint=True``, every window becomes one image."""
     force: bool = False
     """Whether to keep restored frames even if they are judged worse than the raw ones."""
+    given: Detections = None
+    """Detections to use instead, one for each window (see ``read_manifest``)."""
+    motion: object = None
+    """A ``FreeMotion`` of all frames to use instead of detections, such as a recorded one (``align_motion``): in image
+    axes, with the exposure start of the first row of frame 0 as time origin. Frames are restored to its place 0."""
 
 
 @options
@@ -337,12 +342,6 @@ class FileRunOptions:
 @options
 class ProcessStackOptions(FileRunOptions, StackOptions):
     """Options of ``process_stack``."""
-
-    given: Detections = None
-    """Detections to use instead, one for each window (see ``read_manifest``)."""
-    motion: object = None
-    """A ``FreeMotion`` of all frames to use instead of detections, such as a recorded one (``align_motion``): in image
-    axes, with the exposure start of the first row of frame 0 as time origin. Frames are restored to its place 0."""
 
 
 @options

@@ -99,7 +99,7 @@ def run(name: str, options: argparse.Namespace, arguments: Sequence[str], consol
             restored=restored,
             timing=TIMING,
             detection=detection,
-            verdict=verdict,
+            outcome=verdict.overall,
             texts={"Detected vibration": detection.summary(), "Restoration": verdict.summary()},
             made_with=f"rsvib_torch {rsv.__version__}: {shlex.join(['python', 'scripts/demo.py', *arguments])}",
         )

@@ -14,7 +14,7 @@ from rsvib_torch.commands.shared_options import check_new
 from rsvib_torch.commands.terminal import Answer, warn, working
 from rsvib_torch.files.atomic import check_writable
 from rsvib_torch.files.reading import Table
-from rsvib_torch.text import AXES, number_of, printable, wrapped
+from rsvib_torch.text import AXES, number_of, printable
 
 if TYPE_CHECKING:
     from rsvib_torch.config import Config
@@ -23,23 +23,17 @@ if TYPE_CHECKING:
     from rsvib_torch.results.presentation import Result
 
 
-_CURVES = {"motion", "times", "displacement", "offsets", "residual", "measured", "predicted"}
+# a value for every row or knot
+_CURVES = {"motion", "times", "displacement", "offsets", "fitted", "measured", "predicted"}
 
 
 def without_curves(result: Result) -> Table:
-    """The values of a result without its curves, which have a value for every row or knot."""
+    """The values of a result without its curves."""
     curves = _CURVES | ({"std"} if isinstance(result, detection.MotionDetection) else set())
     return {name: value for name, value in result.to_dict().items() if name not in curves}
 
 
-def detection_data(result: detection.DetectionResult) -> Table:
-    """A detection without its offset curve."""
-    return {name: value for name, value in result.to_dict().items() if name not in ("offsets", "fitted")}
-
-
-def verdicts(
-    found: Sequence[DetectedVibration | detection.MotionDetection | None],
-) -> dict[str, bool]:
+def verdicts(found: Sequence[DetectedVibration | detection.MotionDetection | None]) -> dict[str, bool]:
     """Whether each axis is reliable in all detections; None is one that failed."""
     flags = [[] if one is None else one.reliable.tolist() for one in found]
     return {name: all(of_one[axis : axis + 1] == [True] for of_one in flags) for axis, name in enumerate(AXES)}
@@ -47,39 +41,28 @@ def verdicts(
 
 def stack_answer(frames: Path, found: detection.DetectionResult, pixel_size: float | None = None) -> Answer:
     """The vibration in a stack, also in units of length if the size of a pixel in m is given."""
-    answer = Answer({f"Vibration in {frames.name}": [found.summary()]}, {"detection": detection_data(found)})
+    answer = Answer({f"Vibration in {frames.name}": [found.summary()]}, {"detection": without_curves(found)})
     answer.reliable = verdicts([found])
     if pixel_size is not None:
         answer.results[f"For pixels of {1e6 * pixel_size:.6g} µm"] = [found.physical_summary(pixel_size)]
     return answer
 
 
-def restoration_of(run: stacks.StackReport) -> tuple[list[str], Table]:
-    """What a run restored, as lines and as data, with warnings; the lines of a single window have its verdict."""
-    stored = stacks.read_manifest(run.manifest)
-    if run.windows != 1 or run.first is None or run.first.restoration is None:
-        warn_of_failures(stored)
-        return [run.summary(), *stored.lines()[1][1:]], stored.totals()
-    result, count = run.first.restoration, number_of(stored.windows[0].last + 1, "frame")
-    verdict = result.verdict
-    # 1. A warning if there is nothing to restore, or if restoration does not help or may not.
-    nothing, unchanged = "no vibration was found that can be removed", "the frames are written unchanged"
-    if not result.restored and verdict is None:
-        warn(f"{nothing}: {unchanged}")
-    elif verdict is not None and verdict.overall in ("partly", "worse"):
-        warn(verdict.sentence + ("" if result.restored else f"; {unchanged}, --force writes the restored ones"))
-    # 2. What was restored and its gain, and which axes were left unchanged and why.
-    lines = [f"{count} unchanged"]
-    if result.restored:
-        frames = count if len(result.frames) == stored.windows[0].last + 1 else f"1 image of {count}"
-        lines = [f"{frames} restored along {' and '.join(result.restored_axes())}"]
-    unknown = "cannot determine whether restoration helps: no two frames show the same scene"
-    lines.append(verdict.sentence if verdict is not None else unknown if result.restored else nothing)
-    for reason in result.left_alone:
-        is_above = reason.code == "axis_not_reliable"  # its reasons were printed before
-        text = f"{reason.axis} unchanged: its vibration is not reliable, see the reasons above"
-        lines.append(text if is_above else str(reason))
-    return [wrapped(line) for line in lines] + stored.losses, stored.totals()
+def restoration_lines(run: stacks.StackReport, stored: stacks.StackManifest) -> list[str]:
+    """What a run restored, with warnings of what failed, and of frames that are not better."""
+    nothing, forced = "no vibration was found that can be removed", " (--force writes the restored ones)"
+    if run.bad_frames:
+        warn(f"{number_of(run.bad_frames, 'frame')} could not be used: see {run.manifest.name}")
+    failed = [record for record in stored.windows if record.error is not None]
+    if failed:
+        where = f"{number_of(len(failed), 'window')}; in window {failed[0].window}"
+        warn(f"detection failed in {where}: {failed[0].error}")
+    if not run.restored and not stored.doubts and not failed:
+        warn(f"{nothing}: the frames are written unchanged")
+    if {"partly", "worse"} & {record.outcome for record in stored.windows}:
+        unchanged = any(record.outcome == "worse" and record.frames == "as taken" for record in stored.windows)
+        warn(" ".join(stored.doubts) + (f"; its frames are written unchanged{forced}" if unchanged else ""))
+    return [run.summary(), *stored.lines()[1]]
 
 
 def next_step(sentence: str, *command: object) -> str:
@@ -144,33 +127,24 @@ def write_detection(
         replace(result, timing=timing).save(folder / "vibration.json")
         reports.write_table(folder / "tones.csv", result, pixel_size=pixel_size)
         reports.write_offsets(folder / "offsets.csv", result)
-        reports.save_figure(reports.offset_figure(result), folder / "offsets.png")
-    names = ["vibration.json", "tones.csv", "offsets.csv"]
+        result.plot(folder / "offsets.png")
     with working("computing the spectrum"):
         try:
             spectrum = result.spectrum()
         except ValueError as error:  # few rows were measured; the frames are restored all the same
             warn(f"the spectrum is not written: {error}")
-            return ["offsets.png", *names]
-        reports.write_table(folder / "spectrum.csv", spectrum, pixel_size=pixel_size)
-        reports.save_figure(spectrum.plot(), folder / "spectrum.png")
-    return ["offsets.png", "spectrum.png", *names, "spectrum.csv"]
+        else:
+            reports.write_table(folder / "spectrum.csv", spectrum, pixel_size=pixel_size)
+            spectrum.plot(folder / "spectrum.png")
+    names = ("offsets.png", "spectrum.png", "vibration.json", "tones.csv", "offsets.csv", "spectrum.csv")
+    return [name for name in names if (folder / name).exists()]
 
 
 def write_windows(folder: Path, manifest: stacks.StackManifest, pixel_size: float | None = None) -> list[str]:
-    """Write table and figure of windows, warn of failures, and return the names of the files."""
-    warn_of_failures(manifest)
+    """Write table and figure of windows, and return the names of the files."""
     with working("drawing the windows"):
         reports.write_table(folder / "tones.csv", manifest, pixel_size=pixel_size)
         if manifest.gyroscope is not None:  # no tones are searched for
             return ["tones.csv"]
-        reports.save_figure(manifest.plot(), folder / "windows.png")
+        manifest.plot(folder / "windows.png")
     return ["windows.png", "tones.csv"]
-
-
-def warn_of_failures(manifest: stacks.StackManifest) -> None:
-    """Print a warning if detection or restoration failed in windows."""
-    failed = [record for record in manifest.windows if record.error is not None]
-    if failed:
-        where = f"{number_of(len(failed), 'window')}; in window {failed[0].window}"
-        warn(f"detection failed in {where}: {failed[0].error}")

@@ -11,7 +11,7 @@ from typing import Annotated, BinaryIO
 
 from rsvib_torch import io, tracking, video
 from rsvib_torch.checks.values import NotNegative, options
-from rsvib_torch.commands.answers import detection_data
+from rsvib_torch.commands.answers import without_curves
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.shared_options import CameraOptions, check_file
 from rsvib_torch.commands.terminal import Answer, warn
@@ -119,7 +119,7 @@ def _answer(source: str, report: video.LiveReport, files: list[Path], *, waits: 
     found = report.detection
     names = ("frames", "tracked", "corrected", "predicted", "unusable", "dropped", "lost", "detections", "seconds")
     data = {name: getattr(report, name) for name in names} | delays
-    data["detection"] = None if found is None else detection_data(found)
+    data["detection"] = None if found is None else without_curves(found)
     results = {f"Live frames of {source}": lines}
     if found is not None:
         results["Vibration at the last frame"] = [found.summary()]

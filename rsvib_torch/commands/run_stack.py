@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import rsvib_torch
 from rsvib_torch import detection, io, stacks, video
@@ -19,11 +19,10 @@ from rsvib_torch.commands.terminal import Answer, current_output, warn, working
 from rsvib_torch.files.atomic import whole
 from rsvib_torch.files.reading import Table
 from rsvib_torch.options import ProcessVideoOptions, StackOptions
-from rsvib_torch.text import number_of, printable
+from rsvib_torch.text import printable
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
+    from rsvib_torch.motion.detected_vibration import DetectedVibration
 
 _RESULTS = (*answers.OF_DETECTION, *answers.OF_WINDOWS, "before_after.png", "report.html")
 
@@ -94,153 +93,109 @@ def run(given: RunCommand) -> Answer:
     current_output().work = stacks.work_folder(restored)
     given.print_notes()
     # 1. The restored frames and their manifest.
-    result = _process_video(given) if given.is_followed else _process(given)
-    stored, first = stacks.read_manifest(result.manifest), result.first
-    # 2. Figure, tables and page.
-    page = _video_page(given, stored) if first is None else _window_page(given, first, stored)
+    of_run = given.moved if given.is_followed else {"detection": settings.detection}
+    result = given.process(restored, of_run | {"manifest": out / "manifest.json"}, followed=given.is_followed)
+    stored = stacks.read_manifest(result.manifest)
+    # 2. Tables and figures of one vibration of all frames, or of the windows; the page.
+    page = _page(given, stored, result.detection or _first_detection(given, stored))
+    found = page.detection if page.windows is None else None
+    answer = _answer(given, found, stored)
+    answer.results["Restoration"] = answers.restoration_lines(result, stored)
     with whole(out, "folder") as folder:
-        drawn = []
+        names = [restored.name] if given.is_followed else []
         if len(page.frames):
             with working("drawing the frames"):
-                reports.save_figure(_comparison(page), folder / "before_after.png")
-            drawn = ["before_after.png"]
-        names = [restored.name, *drawn] if given.is_followed else [*drawn, restored.name]
-        answer, tables = _describe(folder, given, result, page, stored)
-        names += ["manifest.json", *tables]
-        if not given.video and io.is_video(given.frames) and result.restored < result.windows:
-            answer.next_steps.insert(0, answers.run_step(given.frames, out / "followed", settings.arguments))
+                reports.save_figure(reports.frames_figure(page), folder / "before_after.png")
+            names.append("before_after.png")
+        names += [*([] if given.is_followed else [restored.name]), "manifest.json"]
+        if found is not None:
+            names += answers.write_detection(folder, found, page.timing, given.pixel_size)
+        else:
+            names += answers.write_windows(folder, stored, given.pixel_size)
         if given.report:
             pages = _write_page(folder, page, stored, answer)
             answers.check_folder(out, pages, overwrite=True, inputs=given.inputs)
-            names = list(dict.fromkeys(pages + names))  # the page shows the curves of offsets.png as well
+            names = list(dict.fromkeys(pages + names))  # the page shows other figures as well
         elif result.restored:
             command = (current_output().command or "").replace(" --resume", "")
             answer.next_steps.insert(0, f"write a page with all figures:\n  {command} --resume --report")
-    if given.is_followed:
-        _describe_video(answer, stored, result)
     if given.overwrite:
         answers.remove_old(out, _RESULTS, names)
     answer.files += [out / name for name in names]
     return answer
 
 
-def _process(given: RunCommand) -> stacks.StackReport:
-    """Process a stack in windows; the first one is computed again if it was complete before."""
-    of_run = given.of_stack | {"detection": given.settings.detection}
-    report = given.process(given.restored, of_run | {"manifest": given.out / "manifest.json"})
-    if report.bad_frames:
-        warn(f"{number_of(report.bad_frames, 'frame')} could not be used: see manifest.json")
-    if report.first is not None:
-        return report
-    of_run |= {"window": given.window, "force": given.force}
+def _first_detection(given: RunCommand, stored: stacks.StackManifest) -> DetectedVibration | None:
+    """The detection in the first window of a run that was complete before, if it is shown."""
+    if stored.is_removed or stored.windows[0].detection is None or not (given.report or len(stored.windows) == 1):
+        return None
+    of_run = given.of_stack | {"detection": given.settings.detection, "window": given.window, "force": given.force}
     of_windows = {name: value for name, value in of_run.items() if name in fields_of(StackOptions)}
-    first = next(iter(stacks.iterate_stack(given.frames, given.settings.timing, **of_windows)))
-    return replace(report, first=first)
+    return stacks.first_detection(given.frames, given.settings.timing, StackOptions(**of_windows))
 
 
-def _process_video(given: RunCommand) -> stacks.StackReport:
-    """Process a video from frame to frame."""
-    of_run = given.of_stack | given.moved | {"manifest": given.out / "manifest.json"}
-    with working(f"restoring {given.frames.name}", counts=True) as progress:
-        return video.process_video(given.frames, given.restored, given.settings.timing, **of_run, progress=progress)
-
-
-def _page(given: RunCommand, stored: stacks.StackManifest, **shown: Any) -> reports.Report:
-    """The page of a run that shows some frames."""
+def _page(given: RunCommand, stored: stacks.StackManifest, found: DetectedVibration | None) -> reports.Report:
+    """The page of a run: usable frames of the first window, of a video two neighbours; without a page, one frame."""
+    # 1. The frames that are shown; of an image that was restored jointly from all, the middle one of the input.
+    record, bad, restoration = stored.windows[0], stored.bad_frames, given.of_stack["restoration"]
+    joint, mosaic = restoration.get("joint") is True, restoration.get("mosaic")
+    is_restored = any(one.frames == "restored" for one in (stored.windows if given.is_followed else (record,)))
+    shown = [number for number in range(record.last + 1) if str(number) not in bad]
+    if given.is_followed:  # earlier frames must be decoded as well
+        start = min((n for n in shown if n + 1 in shown), key=lambda number: abs(number - 8), default=record.last + 1)
+        shown = [number for number in shown if start <= number <= start + 1]
+    elif not joint:
+        shown = [number for number in shown if number < record.written]
+    if not given.is_followed and not given.report:
+        middle = len(shown) // 2 if joint else 0
+        shown = shown[middle : middle + 1]
+    # 2. Their pixels as taken and as written.
+    before, after = io.read_frames(given.frames, shown, given.scale), None
+    if stored.margins is not None:
+        before = video.Margins(**stored.margins).cut(before)
+    if mosaic is not None:
+        before = preparation.colour_frames(before, mosaic)
+    if len(shown) and is_restored:
+        scale = None if io.is_video(given.restored) else given.scale
+        after = io.read_frames(given.restored, [0] if joint else shown, scale)
+    # 3. What was found in them.
+    detected = found if isinstance(found, detection.DetectionResult) else None  # of a steady vibration
+    alone = detected is not None and len(stored.windows) == 1
+    timing = io.timing_from_first_frame(given.settings.timing, given.info)
     return reports.Report(
         title=printable(f"Vibration in {given.frames.name}"),
         subtitle=printable(f"{given.frames}, camera of {given.settings.source}"),
         made_with=f"rsvib_torch {rsvib_torch.__version__}: {current_output().command}",
-        **{"windows": stored, "timing": io.timing_from_first_frame(given.settings.timing, given.info), **shown},
+        frames=before.nan_to_num(0.0),
+        restored=after,
+        first=next(iter(shown), 0),
+        timing=detected.timing if detected is not None and not alone and detected.timing is not None else timing,
+        detection=detected,
+        outcome=record.outcome,
+        windows=None if alone else stored,
     )
 
 
-def _window_page(given: RunCommand, first: stacks.WindowResult, stored: stacks.StackManifest) -> reports.Report:
-    """The page of the first window: all of its frames, or without a page one of them: of a joint image, the middle."""
-    after, mosaic = first.frames.cpu(), given.of_stack["restoration"].get("mosaic")
-    indices = first.indices or [index for index in first.window.written if index not in first.bad_frames]
-    if not given.report:
-        middle = 0 if first.indices else len(indices) // 2
-        indices, after = indices[middle : middle + 1], after[:1]
-    before = io.read_frames(given.frames, indices, given.scale).nan_to_num(0.0) if len(after) else after
-    if len(before) and mosaic is not None:
-        before = preparation.colour_frames(before, mosaic)
-    restored = after if first.restored else None
-    shown: Table = {"frames": before, "restored": restored, "first": next(iter(indices), 0)}
-    if first.restoration is not None:
-        shown["verdict"] = first.restoration.verdict
-    if isinstance(first.detection, detection.DetectionResult):  # of a steady vibration
-        shown["detection"] = first.detection
-        if len(stored.windows) == 1:
-            shown["windows"] = None
-        elif first.detection.timing is not None:
-            shown["timing"] = first.detection.timing
-    return _page(given, stored, **shown)
-
-
-def _video_page(given: RunCommand, stored: stacks.StackManifest) -> reports.Report:
-    """The page of two frames near the begin of a video."""
-    bad = stored.bad_frames
-    usable = (number for number in range(given.info.shape[0] - 1) if not {str(number), str(number + 1)} & bad.keys())
-    first = min(usable, key=lambda number: abs(number - 8), default=None)  # earlier frames must be decoded as well
-    indices = () if first is None else (first, first + 1)  # no two neighbours could be used
-    before, after = io.read_frames(given.frames, indices, stored.settings["full_scale"]), None
-    if stored.margins is not None:
-        before = video.Margins(**stored.margins).cut(before)
-    if any(record.frames == "restored" for record in stored.windows):
-        after = io.read_frames(given.restored, indices)
-    return _page(given, stored, frames=before, restored=after, first=first or 0, timing=given.settings.timing)
-
-
-def _describe(
-    folder: Path, given: RunCommand, result: stacks.StackReport, page: reports.Report, stored: stacks.StackManifest
-) -> tuple[Answer, list[str]]:
-    """The answer, and the names of the tables and figures of one vibration of all frames, or of the windows."""
-    frames, found, title = given.frames, page.detection, f"Vibration in {given.frames.name}"
-    if page.windows is None and found is not None and result.first is not None and result.first.error is None:
-        names = answers.write_detection(folder, found, page.timing, given.pixel_size)
-        answer = answers.stack_answer(frames, found, given.pixel_size)
-        answer.results["Restoration"], answer.data["restoration"] = answers.restoration_of(result)
-        answer.next_steps = answers.steps_after_detection(found, frames, given.settings)
+def _answer(given: RunCommand, found: detection.DetectionResult | None, stored: stacks.StackManifest) -> Answer:
+    """The answer about one vibration of all frames, or about the windows, with steps and warnings about a video."""
+    if found is not None:
+        answer = answers.stack_answer(given.frames, found, given.pixel_size)
+        answer.data["restoration"] = stored.totals()
+        answer.next_steps = answers.steps_after_detection(found, given.frames, given.settings)
     else:
-        names = answers.write_windows(folder, stored, given.pixel_size)
-        answer = Answer({title: stored.lines()[0]}, {"windows": stored.totals()})
+        answer = Answer({f"Vibration in {given.frames.name}": stored.lines()[0]}, {"windows": stored.totals()})
         answer.reliable = answers.verdicts([record.detection for record in stored.windows])
-        answer.results["Restoration"] = [result.summary(), *stored.lines()[1][1:]]
-    return answer, names
-
-
-def _describe_video(answer: Answer, stored: stacks.StackManifest, result: stacks.StackReport) -> None:
-    """Add what was found in a video to the answer, and warn of frames that are not better."""
-    if result.bad_frames:
-        bad = number_of(result.bad_frames, "frame")
-        warn(f"{bad} could not be used and repeat the frame before: see manifest.json")
-    if not result.restored:
-        warn("no vibration was found that can be removed: the frames are written unchanged")
-    if stored.settings["video"].get("stabilised"):
-        warn(
-            "the camera has stabilised the frames (IORI in the track of the video): they are moved as a whole, and "
-            "vibration within them is not measured"
-        )
-    worse = [record for record in stored.windows if record.outcome == "worse"]
-    if worse:
-        where = f"{len(worse)} of {number_of(result.windows, 'part')} of the video"
-        warn(f"restored frames would shake more than the input in {where}, whose rows are left as taken")
-    for name, where in (("frame_to_frame", "from frame to frame"), ("rows", "between the rows of a frame")):
-        if stored.shaking is not None:
-            before, after = stored.shaking[name]
-            answer.results["Restoration"].append(f"shaking {where}: {before:.2g} px rms, {after:.2g} px afterwards")
-    answer.data["shaking"] = stored.shaking
-
-
-def _comparison(page: reports.Report) -> Figure:
-    """Draw a frame before and after restoration."""
-    frames, after = page.frames, page.restored
-    if after is None:
-        return reports.comparison_figure(frames[0], frames[0], names=("input", "unchanged"))
-    before = frames[0 if len(after) == len(frames) else len(frames) // 2]
-    raw = preparation.enlarged(before, after.shape[-1] // before.shape[-1])
-    return reports.comparison_figure(raw, after[0].nan_to_num(0.0))
+    if given.is_followed:
+        answer.data["shaking"] = stored.shaking
+        if stored.settings["video"].get("stabilised"):
+            warn(
+                "the camera has stabilised the frames (IORI in the track of the video): they are moved as a whole, and "
+                "vibration within them is not measured"
+            )
+    elif io.is_video(given.frames) and not given.video and any(one.frames == "as taken" for one in stored.windows):
+        followed = answers.run_step(given.frames, given.out / "followed", given.settings.arguments)
+        answer.next_steps.insert(0, followed)
+    return answer
 
 
 def _write_page(folder: Path, page: reports.Report, stored: stacks.StackManifest, answer: Answer) -> list[str]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from rsvib_torch import gyroscope, io, stacks
+from rsvib_torch import gyroscope, io, stacks, video
 from rsvib_torch.checks.values import options
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.terminal import note, working
@@ -23,11 +23,8 @@ from rsvib_torch.options import ProcessStackOptions, RestorationOptions, WindowO
 from rsvib_torch.text import AXES
 
 if TYPE_CHECKING:
-    import torch
-
     from rsvib_torch.io import StackInfo
 
-DeviceName = Literal["auto", "cpu", "cuda"]
 _TIMES = {"row_time": "--row-time", "exposure_time": "--exposure", "frame_rate": "--frame-rate"}  # required keys
 
 _TIME_UNITS = {"": 1, "s": 1, "ms": 10**3, "us": 10**6, "µs": 10**6, "μs": 10**6, "ns": 10**9}  # per second
@@ -126,7 +123,7 @@ class StackCommand(CameraOptions):
     """Stack of frames: TIFF, .npy, HDF5, video and others, or a folder of PNG, TIFF or JPEG files. NAME[100:200] are
     its frames 100 to 199, from the first of which times count."""
 
-    device: DeviceName = "auto"
+    device: Literal["auto", "cpu", "cuda"] = "auto"
     """Device for the computation; auto uses a GPU if there is one."""
 
     @cached_property
@@ -142,13 +139,9 @@ class StackCommand(CameraOptions):
     @cached_property
     def scale(self) -> float | None:
         """Full scale of integer frames: of the option, else of the file (or its 8-bit type) or the configuration."""
-        stated, configured = self.info.full_scale, self.settings.full_scale
         if self.full_scale is not None or not self.info.is_integer:
             return self.full_scale
-        if stated is None and configured is None:
-            unknown = f"{self.frames}: the full scale of its {self.info.dtype} counts is not known"
-            raise ValueError(f"{unknown}: give --full-scale, e.g. 4095 for 12 bits, or state it in [sensor]")
-        return configured if stated is None else stated
+        return self.settings.full_scale if self.info.full_scale is None else self.info.full_scale
 
     def print_notes(self) -> None:
         """Print what the file states about orientation, dropped frames and unequal intervals."""
@@ -159,15 +152,6 @@ class StackCommand(CameraOptions):
     def inputs(self) -> list[Path]:
         """Files that are read."""
         return [*io.stack_files(self.frames), *([] if self.config is None else [self.config])]
-
-    @cached_property
-    def torch_device(self) -> "torch.device":
-        """The device."""
-        import torch  # noqa: PLC0415
-
-        if self.device == "cuda" and not torch.cuda.is_available():
-            raise ValueError("--device cuda: no CUDA device is available; use auto or cpu")
-        return torch.device("cuda" if self.device != "cpu" and torch.cuda.is_available() else "cpu")
 
 
 def _joint(text: str) -> bool | int:
@@ -211,16 +195,17 @@ class RestoringCommand(StackCommand):
     @cached_property
     def of_stack(self) -> Table:
         """Options of the functions for stacks: those given, full scale, device, and options of ``restore``."""
-        device = str(self.torch_device)
-        return self.processing | {"full_scale": self.scale, "restoration": self._chosen(), "device": device}
+        return self.processing | {"full_scale": self.scale, "restoration": self._chosen(), "device": self.device}
 
-    def process(self, restored: Path, of_run: Table) -> "stacks.StackReport":
-        """Process the stack in windows, with the options of the command and those of the run."""
-        of_run = Table(window=self.window, force=self.force) | self.of_stack | of_run
-        counts = self.info.shape[0] > of_run["window"]
+    def process(self, restored: Path, of_run: Table, *, followed: bool = False) -> "stacks.StackReport":
+        """Process the stack in windows, or frame by frame, with the options of the command and those of the run."""
+        of_windows = Table() if followed else Table(window=self.window, force=self.force)
+        of_run = of_windows | self.of_stack | of_run
+        counts = followed or self.info.shape[0] > of_run["window"]
+        run = video.process_video if followed else stacks.process_stack
         with working(f"restoring {self.frames.name}", counts=counts) as progress:
             of_run["progress"] = progress if counts else None
-            report = stacks.process_stack(self.frames, restored, self.settings.timing, **of_run)
+            report = run(self.frames, restored, self.settings.timing, **of_run)
         if report.not_kept:
             note(f"{restored}: not kept from the input: {', '.join(report.not_kept)}")
         return report

@@ -29,11 +29,12 @@ def load(given: shared.StackCommand) -> tuple[Tensor, rsvib_torch.SensorTiming]:
 
     The frames are (T, H, W) or (T, C, H, W), full scale 1; the timing has the frame times of the file.
     """
-    stacks.check_stack_fits(given.info, on_gpu=given.torch_device.type != "cpu")
+    device = stacks.chosen_device(given.device)
+    stacks.check_stack_fits(given.info, on_gpu=device.type != "cpu")
     with working(f"reading {given.frames}"):
         frames = io.read_stack(given.frames, full_scale=given.scale)
     given.print_notes()
-    return frames.to(given.torch_device), io.timing_from_first_frame(given.settings.timing, given.info)
+    return frames.to(device), io.timing_from_first_frame(given.settings.timing, given.info)
 
 
 @options
@@ -148,7 +149,7 @@ def restore(given: RestoreCommand) -> Answer:
         detected = reports.read_vibration(vibration, io.timing_from_first_frame(settings.timing, info))
         given.print_notes()
         of_run |= {"given": [detected], "window": max(2, info.shape[0])}
-        answer = Answer({"Vibration": [detected.summary()]}, {"detection": answers.detection_data(detected)})
+        answer = Answer({"Vibration": [detected.summary()]}, {"detection": answers.without_curves(detected)})
     elif given.motion is not None and vibration is None:
         answer = Answer({}, {"alignment": None})
         of_run["motion"] = _motion_of_frames(given, given.motion, replace(info, full_scale=given.scale), answer)
@@ -156,7 +157,9 @@ def restore(given: RestoreCommand) -> Answer:
         raise ValueError("give --vibration FILE, or --motion FILE of a recording")
     # 2. Restoration in windows.
     run = given.process(given.restored, of_run)
-    answer.results["Restoration"], answer.data["restoration"] = answers.restoration_of(run)
+    stored = stacks.read_manifest(run.manifest)
+    answer.results["Restoration"] = answers.restoration_lines(run, stored)
+    answer.data["restoration"] = stored.totals()
     answer.files += [given.restored, given.manifest]
     return answer
 

@@ -17,7 +17,6 @@ from rich.console import Console
 
 from rsvib_torch.execution.progress import listening
 from rsvib_torch.files.reading import Table
-from rsvib_torch.results.reason import options_of_the_program
 from rsvib_torch.text import json_text, one_line, printable, shortened, wrapped
 
 
@@ -53,8 +52,7 @@ def running(arguments: Sequence[str]) -> Iterator[None]:
     """Collect the output of a command line while it runs."""
     _outputs.append(Output(printable(shlex.join(["rsvib", *arguments]))))
     try:
-        with options_of_the_program():
-            yield
+        yield
     finally:
         _outputs.pop()
 

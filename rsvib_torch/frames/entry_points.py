@@ -95,15 +95,6 @@ def vibration_options(
     return lambda function: entry_point(options, function)
 
 
-def source_options(
-    options: Callable[P, Options],
-) -> Callable[
-    [Callable[[PathLike, SensorTiming, Options], Result]], Callable[Concatenate[PathLike, SensorTiming, P], Result]
-]:
-    """Decorator of a function ``(source, timing, options)``."""
-    return lambda function: flat_options(options, checks_arguments(function))
-
-
 def file_options(
     options: Callable[P, Options],
 ) -> Callable[[Callable[[PathLike, PathLike, SensorTiming, Options], Result]], FileFunction[P, Result]]:

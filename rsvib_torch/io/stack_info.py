@@ -14,7 +14,6 @@ from PIL import ExifTags, Image
 from rsvib_torch.checks.arguments import channels_appear_last, check_fields, checked_methods
 from rsvib_torch.files.reading import Table
 from rsvib_torch.frames.full_scale import check_dtype, known_full_scale
-from rsvib_torch.results.presentation import Summarised
 from rsvib_torch.text import one_line
 
 # Endings of videos: of those that are written with H.264 and FFV1, and of those that are only read.
@@ -40,9 +39,9 @@ class Tag:
     scope: Scope  # for which frames it is valid: of the same size only (``"image"``, georeferencing), or for any
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 @checked_methods
-class StackInfo(Summarised):
+class StackInfo:
     """Shape, data type and full scale of a stack in a file.
 
     Attributes:
@@ -94,18 +93,6 @@ class StackInfo(Summarised):
         check_fields(self)
         if len(self.shape) not in (3, 4) or min(self.shape) < 1:
             raise ValueError(f"shape must be (T, H, W) or (T, C, H, W) with sizes of at least 1, got {self.shape}")
-
-    def summary(self) -> str:
-        """The stack in one line."""
-        parts = [f"{self.shape[0]} frames of {self.shape[-2]} x {self.shape[-1]} px", self.dtype]
-        parts += [f"{self.shape[1]} channels"] if self.axes == "TCHW" else []
-        parts += [] if self.full_scale is None else [f"full scale {self.full_scale:g}"]
-        parts += [] if self.camera is None else [self.camera]
-        parts += [] if self.orientation == 1 else [f"orientation {self.orientation}"]
-        parts += [] if self.frame_rate is None else [f"{self.frame_rate:.6g} frames per second"]
-        if self.frame_times:
-            parts.append(f"frame times {self.frame_times[0]:.6g} … {self.frame_times[-1]:.6g} s")
-        return ", ".join(parts)
 
     @property
     def nodata(self) -> float | None:

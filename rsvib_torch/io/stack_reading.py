@@ -131,7 +131,7 @@ def _read_pixels(
             frame_bytes = _FRAME_COPIES * math.prod(info.shape[1:])
             pixel_bytes = (info.shape[0] + joined) * math.prod(info.shape[1:]) * dtype.itemsize
             what = f"{path}: {info.shape[0]} frames of {info.shape[-2]} x {info.shape[-1]} px"
-            remedy = "process the stack in windows (iterate_stack, process_stack, rsvib run)"
+            remedy = "process the stack in windows (process_stack, rsvib run)"
             check_fits(what, pixel_bytes + frame_bytes + info.decoding_bytes, remedy)
             pixels = np.empty(info.shape, dtype)
             advance = steps(len(pixels), "frames")

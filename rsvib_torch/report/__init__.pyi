@@ -1,4 +1,5 @@
 from .page import Report as Report
+from .page import frames_figure as frames_figure
 from .page import write_report_page as write_report_page
 from .plots import comparison_figure as comparison_figure
 from .plots import motion_figure as motion_figure

@@ -1,8 +1,9 @@
 """The page of ``rsvib run --report``: verdict, frames before and after, figures and texts, in one file."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -19,8 +20,7 @@ from rsvib_torch.frames.pixels import enlarged
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, blind_frequencies
 from rsvib_torch.report import plots
-from rsvib_torch.restoration import RestorationVerdict, trusted_vibration
-from rsvib_torch.results.presentation import figure_png
+from rsvib_torch.restoration import trusted_vibration
 from rsvib_torch.stacks import StackManifest
 from rsvib_torch.text import data_uri
 
@@ -46,7 +46,7 @@ class Report:
     restored: Tensor | None = None
     # the detection (not a batch); None: the frames are those of a run that measured another motion, with ``windows``
     detection: DetectionResult | None = None
-    verdict: RestorationVerdict | None = None  # comparison of pairs of frames; None if they could not be compared
+    outcome: str | None = None  # ``RestorationVerdict.overall``; None if the frames could not be compared
     windows: StackManifest | None = None  # windows of the stack that were processed separately; None if there are none
     texts: Mapping[str, str] = field(default_factory=dict)  # summaries of results, by their headings
     next_steps: Sequence[str] = ()  # what to do next: sentences, with the command that does it on a line of its own
@@ -58,23 +58,22 @@ def headline(report: Report) -> tuple[str, str]:
     """Overall result: ``"good"``, ``"doubt"`` or ``"bad"``, which selects its colour, and its sentence."""
     result, windows = report.detection, report.windows
     totals: Table = {} if windows is None else windows.totals()
-    outcome = "unknown" if report.verdict is None else report.verdict.overall
     mark = "doubt"
     if report.restored is None and totals.get("restored"):
         text = "These frames are unchanged; other windows of the stack were restored, see below."
-    elif report.restored is None and report.verdict is None:
+    elif report.restored is None and report.outcome is None:
         text = "No vibration was found that can be removed; the frames are unchanged."
     elif report.restored is None:
         mark, text = "bad", "Restoration does not improve the frames; they are unchanged."
     elif result is None:
         mark = "good" if totals["outcomes"].get("helps") == totals["windows"] else "doubt"
         text = "The vibration changes; it was measured and removed by rsvib run."
-    elif outcome == "worse" or not bool(result.reliable.any()):
+    elif report.outcome == "worse" or not bool(result.reliable.any()):
         mark = "bad"
         text = "The detected vibration is not reliable; inspect the restored frames before you use them."
-    elif outcome == "unknown":
+    elif report.outcome in ("unknown", None):
         text = "The vibration was measured; these frames are not sufficient to determine whether restoration helps."
-    elif outcome == "helps" and bool(result.reliable.all()):
+    elif report.outcome == "helps" and bool(result.reliable.all()):
         mark = "good"
         text = "The vibration of the camera was measured and removed; restoration improves the frames."
     else:
@@ -156,26 +155,41 @@ def frames_in_turn(report: Report, index: int, image_motion: Tensor) -> Table | 
 # --- Figures ---
 
 
-def figures_of(report: Report, index: int, removed: Vibration | None) -> Iterator[tuple[str, str, Figure]]:
-    """Name of the file, caption, and figure of everything that the page shows of frame ``index``."""
-    result, finer = report.detection, report.restored
-    if finer is not None:
-        points = finer.shape[-1] // report.frames.shape[-1]
-        pair = enlarged(report.frames[index], points), finer[min(index, len(finer) - 1)]
-        compared = [frame.nan_to_num(0.0) for frame in pair]
+def _shown_index(report: Report) -> int:
+    """Place of the frame that is compared: an image that was restored jointly from all frames with the middle one."""
+    count, restored = len(report.frames), report.restored
+    return count // 2 if restored is not None and len(restored) < count else 0
+
+
+def frames_figure(report: Report) -> Figure:
+    """Draw the parts of a frame with the strongest detail, before and after restoration."""
+    index = _shown_index(report)
+    before = report.frames[index].nan_to_num(0.0)
+    if report.restored is None:
+        return plots.comparison_figure(before, before, names=("input", "unchanged"))
+    after = report.restored[min(index, len(report.restored) - 1)].nan_to_num(0.0)
+    if after.ndim > before.ndim:  # grey frames in a video of colours
+        after = after.mean(0)
+    return plots.comparison_figure(enlarged(before, after.shape[-1] // before.shape[-1]), after)
+
+
+def figures_of(report: Report, removed: Vibration | None) -> Iterator[tuple[str, str, Callable[[], Figure]]]:
+    """Name of the file, caption, and drawing of everything that the page shows."""
+    if report.restored is not None:
+        points = report.restored.shape[-1] // report.frames.shape[-1]
         grid = f", which have {points} x {points} points per px" * (points > 1)
         caption = f"Parts of both frames with the strongest detail{grid}; each pair has a grey scale of its own."
-        yield "details", caption, plots.comparison_figure(*compared, size=96 * points)
-    if result is not None:
+        yield "before_after", caption, partial(frames_figure, report)
+    if report.detection is not None:
         caption = "Measured offsets of the rows between frames, offsets by the detected vibration, and the residual."
-        yield "offsets", caption, plots.offset_figure(result)
+        yield "offsets", caption, report.detection.plot
     if removed is not None and bool(removed.moving_axes().any()):
         num_rows = report.frames.shape[int(report.timing.scan_axis)]
         caption = "Point spread functions of rows of frame 0, and the path of the image during their exposure."
-        yield "psf", caption, plots.psf_figure(removed, report.timing, num_rows)
+        yield "psf", caption, partial(plots.psf_figure, removed, report.timing, num_rows)
     if report.windows is not None and report.windows.gyroscope is None:  # no tones are searched for otherwise
         caption = "Amplitude and frequency over the windows, with two standard deviations."
-        yield "windows", caption, report.windows.plot()
+        yield "windows", caption, report.windows.plot
 
 
 # --- Page ---
@@ -194,8 +208,11 @@ def _camera(timing: SensorTiming) -> str:
 
 
 def write_report_page(folder: Path, report: Report) -> list[str]:
-    """Write ``report.html`` and its figures as PNG files into an existing folder; returns the names of the files."""
-    result, timing, finer, count = report.detection, report.timing, report.restored, len(report.frames)
+    """Write ``report.html`` and its figures as PNG files into an existing folder; returns the names of the files.
+
+    A figure that the folder has already is not drawn again.
+    """
+    result, timing, finer, index = report.detection, report.timing, report.restored, _shown_index(report)
     # the motion that was removed, at the centre of the frame
     removed, image_motion = None, torch.zeros(2)
     if result is not None:
@@ -204,9 +221,12 @@ def write_report_page(folder: Path, report: Report) -> list[str]:
     elif report.windows is not None:
         motion = report.windows.windows[0].motion
         image_motion = image_motion if motion is None else motion.tones.image_motion
-    # an image that was restored jointly from all frames is compared with the one in the middle
-    index = count // 2 if finer is not None and len(finer) < count else 0
-    figures = [(name, text, figure_png(figure, dpi=140)) for name, text, figure in figures_of(report, index, removed)]
+    figures = []
+    for name, caption, draw in figures_of(report, removed):
+        path = folder / f"{name}.png"
+        if not path.exists():
+            plots.save_figure(draw(), path)
+        figures.append((name, caption, data_uri(path.read_bytes(), "image/png")))
     if finer is not None:  # frames are shown on the grid of pixels
         points = finer.shape[-1] // report.frames.shape[-1]
         report = replace(report, restored=finer[..., ::points, ::points])
@@ -219,12 +239,10 @@ def write_report_page(folder: Path, report: Report) -> list[str]:
         mark=mark,
         headline=sentence,
         frames=[shown for shown in (whole_frame(report, index), frames_in_turn(report, index, image_motion)) if shown],
-        figures=[(name, text, data_uri(png, "image/png")) for name, text, png in figures],
+        figures=figures,
         camera=_camera(timing),
         created=datetime.now().astimezone().isoformat(" ", "seconds"),
     )
     with whole(folder / "report.html") as part:
         part.write_text(text, encoding="utf-8")
-    for name, _, png in figures:
-        (folder / f"{name}.png").write_bytes(png)
     return ["report.html", *(f"{name}.png" for name, _, _ in figures)]

@@ -6,8 +6,7 @@ is written from the table.
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from operator import attrgetter
@@ -25,7 +24,8 @@ class ReasonKind:
     """The reasons of one code: their text, and what they compare.
 
     Sentence and remedy are templates with the fields ``value``, ``limit``, ``axis``, ``other`` (the axis across it) and
-    the names of the details. A part in square brackets is omitted if one of its details is not given.
+    the names of the details. A part in square brackets is omitted if one of its details is not given. They are read by
+    users of Python and of the program: options have their names in Python, which configuration files have as well.
     """
 
     sentence: str  # template of the sentence
@@ -77,10 +77,7 @@ class Reason:
             names = {name for _, name, _, _ in Formatter().parse(match[1]) if name}
             return match[1] if names <= values.keys() else ""
 
-        text = re.sub(r"\[([^]]*)\]", part, template).format_map(values)
-        for name, option in _OPTIONS.items() if _of_program else ():
-            text = text.replace(name, option)
-        return text
+        return re.sub(r"\[([^]]*)\]", part, template).format_map(values)
 
     @property
     def with_axis(self) -> str:
@@ -107,34 +104,6 @@ class Reason:
 
 
 _COMPARED = ("value", "limit")
-# What texts of Python name, and the same for users of the program
-_OPTIONS = {
-    "detect_motion": "rsvib motion",
-    "check frame_rows, row_time": "check --frame-rate, --row-time",
-    "check exposure_rows": "check --exposure",
-    "frame_rows and row_time, which": "--frame-rate and --row-time, which",
-    "check row_time": "check --row-time",
-    "scan_axis, readout_direction": "--scan-axis, --readout-direction",
-    "increase search": "increase search in [detection]",
-    "pass row_time=(low, high)": "give --row-time twice",
-    "scan_axis=": "--scan-axis ",
-    "readout_direction=": "--readout-direction ",
-    "detect_vibration with image_acceleration=True": "rsvib detect with image_acceleration = true in [detection]",
-    "roll=True, zoom=True and no columns": "no columns, and true for roll and zoom, in [detection]",
-}
-_of_program: list[bool] = []  # not empty while a command runs
-
-
-@contextmanager
-def options_of_the_program() -> Iterator[None]:
-    """Texts of reasons name the options of the program instead of those of Python."""
-    _of_program.append(True)
-    try:
-        yield
-    finally:
-        _of_program.pop()
-
-
 _AT_RADIUS = "[ (px: at {radius:.0f} px from the centre)]"  # for components of roll and zoom
 
 
@@ -154,7 +123,7 @@ def read_findings(values: object) -> Reason | Findings:
 
 _MORE_FRAMES = "use more frames"
 _MAY_BE_STILL = "the camera may stand still along this axis; use more frames if a vibration is expected"
-_CHANGES = "detect_motion if the vibration changes"
+_CHANGES = "detect_motion (rsvib motion) if the vibration changes"
 _TONES_OR_FREE = f"try more tones, or {_CHANGES}"
 _CHECK_TIMING = "and check frame_rows, row_time, exposure_rows and the times of frames (lost or repeated ones?)"
 _UNCERTAIN = "the displacement of the rows is uncertain: {size:.2g} ± {value:.2g} px"
@@ -178,7 +147,7 @@ _TONES = {
     "too_many_tones": ReasonKind(
         "{value:g} tones, of at most {limit:g}, do not explain the motion: it is not a sum of few tones, or the timing "
         "is wrong",
-        "try detect_motion",
+        "try detect_motion (rsvib motion)",
         "number of tones, if it is the largest that is tried (4)",
         free_model=True,
     ),
@@ -245,7 +214,7 @@ _TONES = {
     ),
     "halves_apart": _px(
         "left and right halves of the rows move apart by {value:.3g} px along {other}, {limit:.2g} px are allowed: the "
-        "camera rolls or zooms (pass roll=True, zoom=True and no columns), or the scene has parallax (select a "
+        "camera rolls or zooms (measure it with roll, zoom and no columns), or the scene has parallax (select a "
         "part of the frame with one distance)",
         compares="rms difference between the halves of the rows along the other axis, above 0.035 px and 0.9 % of the "
         "rms offsets",
@@ -333,7 +302,7 @@ _SHAPES = {
     ),
     "motion_uncertain": _px(
         "the motion is determined to {value:.3g} px only, {limit:g} px are needed: frames may show different scenes",
-        "use detect_vibration with image_acceleration=True if the motion has a constant acceleration",
+        "use detect_vibration with image_acceleration if the motion has a constant acceleration",
         compares="rms standard deviation of the visible part of the motion, above 0.3 px",
     ),
     "common_motion_uncertain": _px(
@@ -402,14 +371,14 @@ _ROW_TIME = {
     "row_times_ambiguous": _of_result(
         "{value:g} row times explain the frames instead of {limit:g}: {row_time:.4f} us as well as {others} us "
         "(negative: reverse readout)",
-        "pass row_time=(low, high) with limits around the right one, or use frames with vibrations of other, unrelated "
-        "frequencies",
+        "give row_time limits around the right one (--row-time twice), or use frames with vibrations of other, "
+        "unrelated frequencies",
         "number of row times that explain the frames, above 1",
     ),
     "row_time_contradicted": _of_result(
         "no row time within the limits agrees with the vibration: its frequencies per row and per frame contradict "
         "each other (chi-square {value:.3g}, at most {limit:g} is expected)",
-        "check the frame rate, and pass wider limits row_time=(low, high)",
+        "check the frame rate, and give row_time wider limits (--row-time twice)",
         "chi-square of the frequencies of the tones at the row time, above 20",
     ),
     "too_few_frames_for_row_time": _of_result(

@@ -1,7 +1,8 @@
+from .job import chosen_device as chosen_device
 from .manifest import StackManifest as StackManifest
 from .manifest import read_manifest as read_manifest
 from .memory import check_stack_fits as check_stack_fits
-from .process import iterate_stack as iterate_stack
+from .process import first_detection as first_detection
 from .process import process_stack as process_stack
 from .recorded_motion import align_stack as align_stack
 from .recorded_motion import mask_of_regions as mask_of_regions
@@ -11,5 +12,4 @@ from .window_restoration import RestoredFrames as RestoredFrames
 from .window_restoration import restore_trusted as restore_trusted
 from .window_restoration import without_data as without_data
 from .windows import Window as Window
-from .windows import WindowResult as WindowResult
 from .windows import cut_windows as cut_windows

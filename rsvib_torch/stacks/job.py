@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks.arguments import PathLike
+from rsvib_torch.checks.arguments import PathLike, check_device
 from rsvib_torch.checks.values import check_choice
 from rsvib_torch.frames import full_scale as scales
 from rsvib_torch.frames.pixels import check_mosaic, colour_frames, enlarged
@@ -23,13 +23,9 @@ from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.tables import Array
-from rsvib_torch.options import (
-    ProcessStackOptions,
-    RestorationOptions,
-    StackOptions,
-    VibrationOptions,
-)
+from rsvib_torch.options import RestorationOptions, StackOptions, VibrationOptions
 from rsvib_torch.restoration.restore import check_optics
+from rsvib_torch.results.presentation import plain_values
 from rsvib_torch.stacks.memory import windows_at_once
 from rsvib_torch.stacks.window_restoration import (
     WindowMotion,
@@ -38,7 +34,7 @@ from rsvib_torch.stacks.window_restoration import (
     usable_frame,
     without_data,
 )
-from rsvib_torch.stacks.windows import Window, WindowRecord, WindowResult, cut_windows, window_timing
+from rsvib_torch.stacks.windows import Window, WindowRecord, cut_windows, window_timing
 
 WindowFrames = list[Array | str]  # pixels as stored, or why a frame cannot be read
 
@@ -50,7 +46,7 @@ class StackJob:
     source: Path  # the stack
     info: StackInfo  # what its file states
     timing: SensorTiming  # timing of the whole stack
-    options: ProcessStackOptions  # with the full scale (None for floats) and the device that are used
+    options: StackOptions  # with the full scale (None for floats) and the device that are used
     # of every window, the motion to use instead of a detection, from its first frame on; None: it has none
     given: Sequence[DetectedVibration | FreeMotion | None] | None = None
 
@@ -78,36 +74,44 @@ class StackJob:
         rate = out.frame_rate or timing.frame_rate
         return replace(out, full_scale=self.options.full_scale, frame_times=times, time_error=0.0, frame_rate=rate)
 
-    def compute(self, window: Window, pixels: WindowFrames) -> WindowResult:
-        """Detect the vibration in a window, restore its frames and judge the result."""
-        # 1. The frames that can be used.
+    def compute(self, window: Window, pixels: WindowFrames) -> tuple[WindowRecord, Array, DetectedVibration | None]:
+        """Detect the vibration in a window, restore its frames, and judge the result.
+
+        The result is the record of the window, its frames as the file has them, and the detection in the first window.
+        Frames that were not restored are unchanged. One that cannot be read is stored as NaN, or 0 for integers.
+        """
+        # 1. The frames that can be used, of which the first ones are written.
         options, images, faults = self.options, dict[int, Tensor](), dict[int, str]()
-        for index, stored in zip(window.frames, pixels, strict=True):
+        for index, frame in zip(window.frames, pixels, strict=True):
             try:
-                images[index] = usable_frame(stored, index, options.full_scale, self.info.nodata)
+                images[index] = usable_frame(frame, index, options.full_scale, self.info.nodata)
             except ValueError as error:
                 faults[index] = str(error)
-        kept = tuple(index for index in images if index in window.written)
-        none = torch.empty((0, *self.info.shape[1:]), dtype=torch.float32, device="cpu")
-        taken = (torch.stack(list(images.values())) if images else none).to(options.device)
-        bad = {index: fault for index, fault in faults.items() if index in window.written}
-        result = WindowResult(window, kept, self._unchanged(taken[: len(kept)]), None, None, None, bad)
-        if faults and len(images) < 2:
-            return replace(result, error=next(iter(faults.values())))
-        timing = window_timing(self.timing, window, list(images))
+        kept = [index for index in images if index in window.written]
+        record = WindowRecord(
+            window.index,
+            window.first,
+            window.last,
+            start_time=float(self.timing.frame_starts(window.first + 1)[-1]),
+            written=1 if self.is_joined else window.kept,
+            bad_frames={str(index): fault for index, fault in faults.items() if index in window.written},
+        )
+        tones, restored = None, dict[int, Tensor]()
         try:
+            if faults and len(images) < 2:
+                raise ValueError(next(iter(faults.values())))
+            taken = torch.stack(list(images.values())).to(options.device)
             # 2. Their motion.
-            if self.given is None:
-                moved = measured_motion(taken, timing, options.detection or {})
-            else:
-                given = self.given[window.index]
-                if given is None:
-                    return replace(result, error="no detection was given for this window")
-                moved = WindowMotion(given, given if isinstance(given, DetectedVibration) else None, timing)
-            lost_before = None if moved.lost_before is None else window.first + moved.lost_before
-            result = replace(result, detection=moved.tones, motion=moved.free, lost_before=lost_before)
+            moved = self._motion(window, taken, window_timing(self.timing, window, list(images)))
+            tones = moved.tones
+            record = replace(
+                record,
+                detection=None if tones is None else DetectedVibration.of(tones).to("cpu"),
+                motion=None if moved.free is None else moved.free.to("cpu"),
+                lost_before=None if moved.lost_before is None else window.first + moved.lost_before,
+            )
             # 3. The frames without it, and whether they are better.
-            restoration = restore_trusted(
+            done = restore_trusted(
                 taken,
                 moved.timing,
                 moved.motion,
@@ -116,52 +120,56 @@ class StackJob:
                 first_frames=len(kept) if len(kept) > 1 and not self.chosen.joint else None,
                 most_pairs=8 if window.alone else 2,  # limits the time of the verdict
             )
+            verdict = done.verdict
+            unknown = "cannot determine whether restoration helps: no two frames show the same scene"
+            record = replace(
+                record,
+                frames="restored" if done.restored else "as taken",
+                left_alone=done.left_alone,
+                outcome=None if verdict is None else verdict.overall,
+                verdict=verdict.sentence if verdict is not None else unknown if done.restored else None,
+                predicted_gain=None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),
+                lost_rows={str(index): done.lost_rows[at] for at, index in enumerate(kept) if at in done.lost_rows},
+            )
+            # 4. Those that are written; one image of all in place of the middle one.
+            if done.restored:
+                places = [window.middle] if self.is_joined else kept
+                of_places = taken if self.is_joined else taken[: len(kept)]
+                frames = done.frames[: len(places)]
+                frames = frames if self.info.nodata is None else without_data(frames, of_places)
+                restored = dict(zip(places, frames, strict=True))
         except (ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
-            return replace(result, error=" ".join(str(error).split()))
-        result = replace(result, restoration=restoration)
-        if not restoration.restored:
-            return result
-        # 4. Those that are written, or one image of all.
-        frames = restoration.frames
-        if self.is_joined:
-            result = replace(result, indices=())
-        else:
-            taken, frames = taken[: len(kept)], frames[: len(kept)]
-        return replace(result, frames=frames if self.info.nodata is None else without_data(frames, taken))
+            record = replace(record, error=" ".join(str(error).split()))
+        written = [window.middle] if self.is_joined else window.written
+        stored = [
+            self._counts(restored[index]) if index in restored else self._as_taken(pixels[index - window.first])
+            for index in written
+        ]
+        # channels may be stored last
+        return record, np.ascontiguousarray(np.stack(stored)), tones if window.index == 0 else None
 
-    def compute_stored(self, window: Window, pixels: WindowFrames) -> tuple[WindowRecord, Array, WindowResult | None]:
-        """The record of a window, its frames as the file has them, and the result of the first window of the stack.
+    def _motion(self, window: Window, frames: Tensor, timing: SensorTiming) -> WindowMotion:
+        """The motion in the frames of a window, given or measured."""
+        if self.given is None:
+            return measured_motion(frames, timing, self.options.detection or {})
+        given = self.given[window.index]
+        if given is None:
+            raise ValueError("no detection was given for this window")
+        return WindowMotion(given, given if isinstance(given, DetectedVibration) else None, timing)
 
-        Frames that were not restored are unchanged. One that cannot be read is stored as NaN, or 0 for integers.
-        """
-        result, dtype = self.compute(window, pixels), np.dtype(self.info.dtype)
+    def _counts(self, frames: Tensor) -> Array:
+        """Frames as the file has them."""
+        return scales.frames_to_counts(frames, np.dtype(self.info.dtype), self.options.full_scale, self.info.nodata)
 
-        def counts(images: Tensor) -> Array:
-            return scales.frames_to_counts(images, dtype, self.options.full_scale, self.info.nodata)
-
-        def as_taken(index: int) -> Array:
-            frame = pixels[index - window.frames.start]
-            if isinstance(frame, str):
-                frame = np.full(self.info.shape[1:], np.nan if dtype.kind == "f" else 0, dtype)
-            if self.chosen.scale == 1 and self.chosen.mosaic is None:
-                return frame
-            taken = scales.counts_to_frames(frame[None], self.options.full_scale, str(self.source), self.info.nodata)
-            return counts(self._unchanged(taken)[0])  # the shape of restored ones
-
-        if result.restored and self.is_joined:
-            frames = list(counts(result.frames))
-        else:
-            restored = dict(zip(result.indices, result.frames, strict=True)) if result.restored else {}
-            middle = window.written[window.kept // 2]
-            written = [middle] if self.is_joined else window.written
-            frames = [counts(restored[index]) if index in restored else as_taken(index) for index in written]
-        record, first = WindowRecord.of(result, self.timing, len(frames)), result if window.index == 0 else None
-        return record, np.ascontiguousarray(np.stack(frames)), first  # channels may be stored last
-
-    def _unchanged(self, frames: Tensor) -> Tensor:
-        """Frames that were not restored, in the shape of restored ones."""
-        mosaic = self.chosen.mosaic
-        return enlarged(frames if mosaic is None else colour_frames(frames, mosaic), self.chosen.scale)
+    def _as_taken(self, frame: Array | str) -> Array:
+        """A frame that was not restored, in the shape of restored ones."""
+        dtype, mosaic, scale = np.dtype(self.info.dtype), self.chosen.mosaic, self.chosen.scale
+        if isinstance(frame, str):
+            frame = np.full(self.info.shape[1:], np.nan if dtype.kind == "f" else 0, dtype)
+        if scale == 1 and mosaic is None:
+            return frame
+        taken = scales.counts_to_frames(frame[None], self.options.full_scale, str(self.source), self.info.nodata)
+        return self._counts(enlarged(taken if mosaic is None else colour_frames(taken, mosaic), scale)[0])
 
     def _for_counts(self, frames: Tensor) -> RestorationOptions:
         """The options of ``restore``, with the level at which the counts of the file are saturated by themselves."""
@@ -191,7 +199,7 @@ def read_windows(job: StackJob, windows: Iterable[Window]) -> Generator[tuple[Wi
 
 
 def _given(
-    options: ProcessStackOptions, info: StackInfo, timing: SensorTiming, windows: list[Window]
+    options: StackOptions, info: StackInfo, timing: SensorTiming, windows: list[Window]
 ) -> Sequence[DetectedVibration | FreeMotion | None] | None:
     """The given motion of every window, with the time origin at its first frame; None if none is given."""
     motion, given = options.motion, options.given
@@ -216,6 +224,13 @@ def _given(
     return [part.to(options.device) for part in parts]
 
 
+def chosen_device(name: str) -> torch.device:
+    """The device of an option, which must be available."""
+    check_choice("device", name.partition(":")[0], ("auto", "cpu", "cuda"))
+    default = "cuda" if torch.cuda.is_available() else "cpu"
+    return check_device("device", default if name == "auto" else name)
+
+
 def plan_job(source: PathLike, timing: SensorTiming, options: StackOptions) -> tuple[StackJob, list[Window], int]:
     """The job of a run, its windows, and how many of them to compute at once.
 
@@ -228,11 +243,8 @@ def plan_job(source: PathLike, timing: SensorTiming, options: StackOptions) -> t
     timing.frame_starts(info.shape[0])  # raises an error if there are too few frame start times
     timing.check_rows(info.shape[int(timing.scan_axis)])
     VibrationOptions(**options.detection or {})  # raises an error for wrong ones
-    check_choice("device", options.device.partition(":")[0], ("auto", "cpu", "cuda"))
-    default = "cuda" if torch.cuda.is_available() else "cpu"
-    device = default if options.device == "auto" else options.device
-    of_job = {"full_scale": full_scale, "device": device, "restoration": options.restoration or {}, "progress": None}
-    stated = ProcessStackOptions(**{**vars(options), **of_job})
+    device, restoration = str(chosen_device(options.device)), options.restoration or {}
+    stated = replace(options, full_scale=full_scale, device=device, restoration=restoration)
     windows = cut_windows(info.shape[0], stated.window)
     job = StackJob(Path(source), info, timing, stated, _given(stated, info, timing, windows))
     if job.chosen.mosaic is not None:

@@ -80,8 +80,9 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
 
     def summary(self) -> str:
         """Tones over the windows, what was restored, and what failed."""
+        restored = sum(record.frames == "restored" for record in self.windows)
         vibration, restoration = self.lines()
-        return "\n".join([*vibration, *restoration])
+        return "\n".join([*vibration, f"{restored} of {number_of(len(self.windows), 'window')} restored", *restoration])
 
     def table(self, *, pixel_size: float | None = None) -> dict[str, list[object]]:
         """One row per tone, axis and window, as in ``DetectedVibration.table``; a failed window has one row.
@@ -139,34 +140,55 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
         }
 
     def lines(self) -> tuple[list[str], list[str]]:
-        """The totals as lines of text: about the vibration, and about the restoration."""
-        data = self.totals()
-        # All windows were measured, and nothing else than missing tones is stated against any axis.
+        """The windows in lines of text: their vibration, and how well and where it was removed."""
+        data, records = self.totals(), self.windows
+        # 1. The vibration: the detection of the only window, or its tones over the windows.
         is_video = "video" in self.settings  # a hand may move its camera
-        is_still = (
-            bool(self.windows)
-            and not is_video
-            and all(
-                record.detection is not None
-                and {reason.code for of_axis in record.detection.findings for reason in of_axis} == {"no_tone"}
-                for record in self.windows
-            )
+        alone = records[0].detection if len(records) == 1 and not self.is_removed else None
+        # all windows were measured, and nothing else than missing tones is stated against any axis
+        is_still = not is_video and all(
+            record.detection is not None
+            and {reason.code for of_axis in record.detection.findings for reason in of_axis} == {"no_tone"}
+            for record in records
         )
-        if is_still:
+        if alone is not None:
+            vibration = [alone.summary()]
+        elif is_still:
             text = "the camera stands still, or moves uniformly or by less than the noise"
             vibration = [wrapped(f"no window has a significant tone: {text}")]
         else:
             vibration = self._tone_lines(data["tones"]) if self.gyroscope is None else _gyroscope_lines(self.gyroscope)
-        if is_video:
-            vibration += self._lines_of_video()
-        restoration = [f"{data['restored']} of {number_of(data['windows'], 'window')} restored"]
+        vibration += self._lines_of_video() if is_video else []
+        # 2. Its removal: the gain, windows and axes that were left unchanged, and what was lost.
+        restoration = []
         if data["predicted_gain_db"] is not None:
             gains = dict.fromkeys(f"{gain:+.1f}" for gain in data["predicted_gain_db"].values())
             restoration.append(f"estimated improvement {' … '.join(gains)} dB")
-        for name, notes in data["left_alone"].items() if not is_still else ():
-            texts = {window: note["text"] for window, note in notes.items()}
-            restoration += [wrapped(f"{name} unchanged in {text}") for text in _first_of(texts)]
+        restoration += self.doubts
+        for name, notes in data["left_alone"].items() if alone is not None or not is_still else ():
+            why = {window: note["text"] for window, note in notes.items()}
+            if alone is not None and any(note["code"] == "axis_not_reliable" for note in notes.values()):
+                why = dict.fromkeys(notes, "its vibration is not reliable, see the reasons above")
+            restoration += self._noted(f"{name} unchanged", why)
+        for (before, after), where in zip(
+            (self.shaking or {}).values(), ("from frame to frame", "between the rows of a frame"), strict=False
+        ):
+            restoration.append(f"shaking {where}: {before:.2g} px rms, {after:.2g} px afterwards")
         return vibration, restoration + self.losses
+
+    def _noted(self, what: str, notes: Mapping[int, str] | Mapping[str, str]) -> list[str]:
+        """A line about the windows that have a note, with the first note; none without notes."""
+        several = number_of(len(notes), "window")
+        return [
+            wrapped(f"{what}: {text}" if len(self.windows) == 1 else f"{what} in {several}; in window {window}: {text}")
+            for window, text in notes.items()
+        ][:1]
+
+    @property
+    def doubts(self) -> list[str]:
+        """A sentence about the windows whose restoration is not known to help."""
+        texts = {one.window: one.verdict for one in self.windows if one.verdict is not None and one.outcome != "helps"}
+        return self._noted("improvement not certain", texts)
 
     def _tone_lines(self, tones: Table) -> list[str]:
         """A table of the tones of each axis over the windows, and what its columns mean."""
@@ -203,10 +225,9 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
         lines = []
         for axis, name in enumerate(AXIS_NAMES[:2]):
             against = {window: [one for one in of.findings[axis] if one.code != "no_tone"] for window, of in found}
-            texts = _first_of({window: "; ".join(map(str, why)) for window, why in against.items() if why})
-            lines += [f"{name} restored as measured, but not reliable in {text}" for text in texts]
-        lines += [f"assumed: {one}" for _, of in found for one in of.assumptions][:1]
-        return [wrapped(line) for line in lines]
+            why = {window: "; ".join(map(str, of_axis)) for window, of_axis in against.items() if of_axis}
+            lines += self._noted(f"{name} restored as measured, but not reliable", why)
+        return lines + [wrapped(f"assumed: {one}") for _, of in found for one in of.assumptions][:1]
 
     @property
     def is_removed(self) -> bool:
@@ -223,11 +244,6 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
             None if one.lost_before is not None else one.detection if one.motion is None else one.motion
             for one in self.windows
         ]
-
-
-def _first_of(notes: Mapping[object, str]) -> list[str]:
-    """Number of windows with a note, and the first one; empty without notes."""
-    return [f"{number_of(len(notes), 'window')}; in window {number}: {text}" for number, text in notes.items()][:1]
 
 
 def _gyroscope_lines(found: Table) -> list[str]:
@@ -288,7 +304,7 @@ def fingerprint(path: Path) -> Table:
 
 
 # options on which the result depends
-_SETTINGS = tuple(name for name in fields_of(StackOptions) if name not in ("memory", "workers"))
+_SETTINGS = tuple(name for name in fields_of(StackOptions) if name not in ("memory", "workers", "given", "motion"))
 
 
 def manifest_header(job: StackJob, output: str) -> Table:

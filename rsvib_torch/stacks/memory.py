@@ -11,7 +11,7 @@ import psutil
 
 from rsvib_torch.files.reading import check_fits, free_memory, size_text
 from rsvib_torch.io.stack_info import StackInfo
-from rsvib_torch.options import OptionTable, ProcessStackOptions
+from rsvib_torch.options import OptionTable, StackOptions
 from rsvib_torch.restoration.priors import PRIOR_BYTES
 from rsvib_torch.text import quoted
 
@@ -72,7 +72,7 @@ def memory_needed(
     return once + count * (_WINDOW_BYTES + pixels * pixel_bytes + queued + more)
 
 
-def windows_at_once(info: StackInfo, options: ProcessStackOptions) -> int:
+def windows_at_once(info: StackInfo, options: StackOptions) -> int:
     """Number of windows that can be processed at once within the memory of the machine.
 
     It is at most ``workers``: by default the number of processors, or 1 on a GPU. The error about too little memory

@@ -1,65 +1,38 @@
-"""Processing of stacks of any length: ``iterate_stack`` and ``process_stack``.
+"""Processing of stacks of any length: ``process_stack``.
 
 One loop: the frames of the source are read in windows; the motion of each window is detected, its frames are restored
 and the result is judged (``StackJob.compute``, in threads); finished windows are stored in a folder (``RunFolder``)
 and become the output and its manifest (``FileRun``) when all of them are there.
 """
 
-from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import TypeVar
 
 import torch
 
 from rsvib_torch.checks.arguments import PathLike
 from rsvib_torch.execution.parallel import in_threads
-from rsvib_torch.frames.entry_points import file_options, source_options
+from rsvib_torch.frames.entry_points import file_options
 from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, stack_files, write_frames
+from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import ProcessStackOptions, StackOptions
-from rsvib_torch.stacks.job import StackJob, WindowFrames, plan_job, read_windows
+from rsvib_torch.stacks.job import plan_job, read_windows
 from rsvib_torch.stacks.manifest import manifest_header
 from rsvib_torch.stacks.memory import share_one_heap
 from rsvib_torch.stacks.run_folder import FileRun, StackReport, check_space
-from rsvib_torch.stacks.windows import Window, WindowResult
 
-_Result = TypeVar("_Result")
 _MAX_INITIAL_FAILURES = 8  # windows; a run stops if detection fails in all of them, or in all of a shorter stack
-
-
-@source_options(StackOptions)
-def iterate_stack(source: PathLike, timing: SensorTiming, options: StackOptions) -> Iterator[WindowResult]:
-    """Restore a stack of any length window by window; each is available as soon as it is complete.
-
-    A stack is cut into windows of at most ``window`` frames that share one frame with their neighbours. Each window is
-    processed as a separate stack, with the time origin at its first frame. Later windows are computed meanwhile.
-
-    Args:
-        source: The stack, as in ``read_stack``.
-        timing: The sensor. If it has no frame start times and the file states them, those of the file are used.
-        options: Options.
-
-    Yields:
-        One ``WindowResult`` per window, in order.
-
-    Example:
-        >>> for result in iterate_stack("frames.tif", timing, window=3):  # doctest: +SKIP
-        ...     print(result.indices, result.detection.vibration.frequency[:, 0].round().tolist())
-        (0,) [110.0, 90.0]
-        (1, 2, 3) [110.0, 90.0]
-    """
-    job, windows, at_once = plan_job(source, timing, options)
-    yield from _in_threads(job, job.compute, windows, at_once)
 
 
 @file_options(ProcessStackOptions)
 def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, options: ProcessStackOptions) -> StackReport:
     """Restore a stack of any length from file to file.
 
-    The stack is cut into windows as in ``iterate_stack``; results do not depend on memory and workers, and memory does
-    not grow with the number of frames. The output gets its name when it is complete; until then it is stored in the
-    folder ``.NAME.rsvib`` beside it, from which an interrupted run can be resumed.
+    The stack is cut into windows of at most ``window`` frames that share one frame with their neighbours. Each is
+    processed as a separate stack, with the time origin at its first frame. Results do not depend on memory and workers,
+    and memory does not grow with the number of frames. The output gets its name when it is complete; until then it is
+    stored in the folder ``.NAME.rsvib`` beside it, from which an interrupted run can be resumed.
 
     Frames that cannot be read or used (constant, infinite, beyond full scale) are listed in the manifest; the other
     frames of their window are restored without them. A window in which the detection fails is written unchanged.
@@ -67,7 +40,7 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
     Args:
         source: The stack, as in ``read_stack``.
         sink: The stack to write; metadata are kept as far as the format supports them (``metadata_not_kept``).
-        timing: As in ``iterate_stack``.
+        timing: The sensor. If it has no frame start times and the file states them, those of the file are used.
         options: Options.
 
     Returns:
@@ -113,13 +86,17 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
         stored += out.shape[0] if form.uncompressed else 0
         check_space(sink, stored * out.frame_bytes)
         # 3. The windows that are not in the folder: read, detected, restored, judged, stored.
-        first: WindowResult | None = None
+        detection: DetectedVibration | None = None
         report = options.progress or (lambda done, total: None)
         report(total - left, total)
-        with closing(_in_threads(job, job.compute_stored, missing, at_once)) as results:
-            for window, (record, frames, result) in zip(missing, results, strict=True):
+        share_one_heap()
+        # Sums of floats depend on the number of threads: results must not depend on how many windows are computed.
+        threads = torch.get_num_threads() if all(window.alone for window in missing) else 1
+        computed = in_threads(job.compute, read_windows(job, missing), at_once=at_once, threads=threads)
+        with closing(computed) as results:
+            for window, (record, frames, found) in zip(missing, results, strict=True):
                 records.append(record)
-                first = first or result
+                detection = detection or found
                 if len(records) >= min(_MAX_INITIAL_FAILURES, len(windows)) and all(one.error for one in records):
                     folder.remove()
                     raise ValueError(records[0].error)
@@ -129,14 +106,11 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
         # 4. The output from the windows in the folder, and the manifest.
         with run.writing(folder, not_kept=metadata_not_kept(job.info, sink, out.shape)) as manifest:
             write_frames(form, sink, out, folder.frames())
-    return run.report(manifest, resumed, first)
+    return run.report(manifest, resumed, detection)
 
 
-def _in_threads(
-    job: StackJob, compute: Callable[[Window, WindowFrames], _Result], windows: Sequence[Window], at_once: int
-) -> Generator[_Result, None, None]:
-    """Results of ``compute`` of windows and their frames, in order; later windows are read and computed meanwhile."""
-    share_one_heap()
-    # Sums of floats depend on the number of threads: results must not depend on how many windows are computed at once.
-    threads = torch.get_num_threads() if all(window.alone for window in windows) else 1
-    return in_threads(compute, read_windows(job, windows), at_once=at_once, threads=threads)
+def first_detection(source: PathLike, timing: SensorTiming, options: StackOptions) -> DetectedVibration | None:
+    """The detection in the first window of a stack with its offset curve, as ``StackReport.detection`` has it."""
+    job, windows, _ = plan_job(source, timing, options)
+    with closing(read_windows(job, windows[:1])) as first:
+        return job.compute(*next(first))[2]

@@ -33,11 +33,12 @@ from rsvib_torch.files import atomic
 from rsvib_torch.files.atomic import PART, check_outputs, make_folder, nearest_folder, sync
 from rsvib_torch.files.reading import Table, size_text
 from rsvib_torch.io.stack_writing import stack_files
+from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import FileRunOptions
 from rsvib_torch.results.presentation import Summarised, decode, plain_values
 from rsvib_torch.stacks.manifest import StackManifest, read_manifest
-from rsvib_torch.stacks.windows import WindowRecord, WindowResult
+from rsvib_torch.stacks.windows import WindowRecord
 from rsvib_torch.text import number_of, one_line
 
 _SETTINGS = "settings.json"
@@ -261,7 +262,7 @@ class StackReport(Summarised):
     bad_frames: int  # number of frames that could not be used
     resumed: int  # number of windows that were complete before
     seconds: float  # duration of the run
-    first: WindowResult | None  # of the first window, if it was computed in this process
+    detection: DetectedVibration | None  # in the first window with its offset curve, if it was computed in this process
     manifest: Path  # path of the manifest
     not_kept: tuple[str, ...]  # metadata of the input that the output does not contain
 
@@ -331,7 +332,7 @@ class FileRun:
         sync(self.manifest.absolute().parent)  # the temporary folder is gone as well
         folder.remove()
 
-    def report(self, manifest: StackManifest, resumed: int, first: WindowResult | None = None) -> StackReport:
+    def report(self, manifest: StackManifest, resumed: int, detection: DetectedVibration | None = None) -> StackReport:
         """The summary of the run, of which ``resumed`` windows were complete before."""
         records = manifest.windows
         return StackReport(
@@ -342,7 +343,7 @@ class FileRun:
             bad_frames=len(manifest.bad_frames),
             resumed=resumed,
             seconds=time.perf_counter() - self._start,
-            first=first,
+            detection=detection,
             manifest=self.manifest,
             not_kept=manifest.not_kept,
         )

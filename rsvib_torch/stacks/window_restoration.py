@@ -6,7 +6,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import math
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -160,13 +160,7 @@ class RestoredFrames:
     left_alone: tuple[Reason, ...]  # a reason for each axis that was not restored
     # whether restoration helps; None if nothing moves, or frames could not be compared, which are restored then
     verdict: RestorationVerdict | None
-    axes: int = 2  # number of components of the motion: 2, 3 with roll, 4 with roll and zoom
-    lost_rows: Mapping[int, int] = field(default_factory=dict)  # number for each of the frames that has some
-
-    def restored_axes(self) -> list[str]:
-        """Names of the axes that were restored."""
-        unchanged = {reason.axis for reason in self.left_alone}
-        return [name for name in AXIS_NAMES[: self.axes] if self.restored and name not in unchanged]
+    lost_rows: Mapping[int, int]  # number for each of the frames that has some
 
 
 def restore_trusted(
@@ -197,7 +191,7 @@ def restore_trusted(
     lost = prepared.lost_rows()
     if not bool(vibration.moving_axes().any()):
         unchanged = prepared.from_row_order(as_taken(prepared, joint, scale))
-        return RestoredFrames(unchanged, False, left_alone, None, lost_rows=lost)
+        return RestoredFrames(unchanged, False, left_alone, None, lost)
     warn_of_mosaic(prepared)
     restored = restore_prepared(prepared, vibration, options)
     verdict = None
@@ -208,7 +202,7 @@ def restore_trusted(
     if keep:
         restored = sharpened(restored, optics, scale)
     result = prepared.from_row_order(restored if keep else as_taken(prepared, joint, scale))
-    return RestoredFrames(result, keep, left_alone, verdict, vibration.num_axes, lost)
+    return RestoredFrames(result, keep, left_alone, verdict, lost)
 
 
 def without_data(frames: Tensor, taken: Tensor) -> Tensor:

@@ -1,20 +1,16 @@
-"""Windows: consecutive frames that are processed together, their results, and the records of these on the disk."""
+"""Windows: consecutive frames that are processed together, and the records of their results."""
 
 import itertools
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
-from torch import Tensor
 
 from rsvib_torch.checks.values import check_whole_number
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.results.presentation import Summarised, plain_values
 from rsvib_torch.results.reason import Reason
-from rsvib_torch.stacks.window_restoration import RestoredFrames
 
 
 @dataclass(frozen=True)
@@ -39,6 +35,11 @@ class Window:
     def written(self) -> range:
         """Indices of the frames that it writes."""
         return range(self.first, self.first + self.kept)
+
+    @property
+    def middle(self) -> int:
+        """Index of the middle one of these, in whose place one image of all frames is written."""
+        return self.written[self.kept // 2]
 
     @property
     def alone(self) -> bool:
@@ -72,83 +73,26 @@ def window_timing(timing: SensorTiming, window: Window, frames: list[int]) -> Se
     return replace(timing, frame_start_times=starts[torch.tensor(frames, device="cpu")] - starts[window.first])
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class WindowResult(Summarised):
-    """One window of a stack, restored."""
-
-    window: Window
-    indices: tuple[int, ...]  # of ``frames`` in the stack; empty if all frames were restored jointly as one image
-    frames: Tensor  # with full scale 1, (T, H, W) or (T, C, H, W): restored, or as taken
-    # with the time origin at the window's first frame; None if it failed. With a ``motion``, tones in its place
-    detection: DetectedVibration | None
-    restoration: RestoredFrames | None  # None without a detection
-    error: str | None  # why detection or restoration failed
-    bad_frames: Mapping[int, str]  # frames of ``window.written`` that could not be used; they are not in ``frames``
-    motion: FreeMotion | None = None  # of a vibration that changes, in place of tones; axes that are not reliable rest
-    lost_before: int | None = None  # frame of the stack before which one is lost: from it on, a frame period later
-
-    @property
-    def restored(self) -> bool:
-        """Whether the frames are restored."""
-        return self.restoration is not None and self.restoration.restored
-
-    def summary(self) -> str:
-        """Frames of the window, its vibration, and what was restored."""
-        state = "restored" if self.restored else "unchanged"
-        lines = [f"window {self.window.index}, frames {self.window.first} … {self.window.last}: {state}"]
-        if self.detection is not None:
-            lines.append(self.detection.summary())
-        if self.restoration is not None:
-            lines += map(str, self.restoration.left_alone)
-            lines += [] if self.restoration.verdict is None else [self.restoration.verdict.sentence]
-        lines += [] if self.error is None else [self.error]
-        return "\n".join([*lines, *(f"frame {index}: {fault}" for index, fault in self.bad_frames.items())])
-
-
 @dataclass(frozen=True, eq=False)
 class WindowRecord:
-    """Result of one window."""
+    """Result of one window, as the manifest has it."""
 
     window: int  # its number
     first: int  # frame
     last: int  # frame
     start_time: float  # s, exposure start of its first row, the time origin of its detection
     written: int  # number of frames written
-    frames: Literal["restored", "as taken"]  # those that are written
+    frames: Literal["restored", "as taken"] = "as taken"  # those that are written
     detection: DetectedVibration | None = None  # None: it failed; with a ``motion``, tones in its place
     left_alone: tuple[Reason, ...] = ()  # a reason for each axis that was not restored
     outcome: str | None = None  # ``RestorationVerdict.overall``; None if the frames could not be compared
+    verdict: str | None = None  # ``RestorationVerdict.sentence``
     predicted_gain: float | None = None  # dB, mean of ``RestorationVerdict.predicted_gain``; None if unknown
     error: str | None = None  # why detection or restoration failed
     bad_frames: dict[str, str] = field(default_factory=dict)  # index of each that could not be used, with the reason
     # Of a part of a video, rms motion in px before and after, in its first frames: ``frame_to_frame``, changes of the
     # motion of the frame, and ``rows``, of twelfths of the rows beside it. None: not measured.
     shaking: dict[str, tuple[float, ...]] | None = None
-    motion: FreeMotion | None = None  # of a window in which the vibration changes, in place of tones; as the detection
+    motion: FreeMotion | None = None  # of a vibration that changes, in place of tones; axes that are not reliable rest
     lost_before: int | None = None  # frame of the stack before which one is lost: from it on, a frame period later
     lost_rows: dict[str, int] = field(default_factory=dict)  # number for each frame of the stack that has some
-
-    @classmethod
-    def of(cls, result: WindowResult, timing: SensorTiming, written: int) -> "WindowRecord":
-        """The record of a result of which ``written`` frames were written; ``timing`` is that of the whole stack."""
-        window, restoration = result.window, result.restoration
-        verdict = None if restoration is None else restoration.verdict
-        usable = [index for index in window.written if index not in result.bad_frames]
-        lost = {} if restoration is None else restoration.lost_rows
-        return cls(
-            window=window.index,
-            first=window.first,
-            last=window.last,
-            start_time=float(timing.frame_starts(window.first + 1)[-1]),
-            written=written,
-            frames="restored" if result.restored else "as taken",
-            detection=None if result.detection is None else DetectedVibration.of(result.detection).to("cpu"),
-            outcome=None if verdict is None else verdict.overall,
-            predicted_gain=None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),
-            bad_frames={str(index): reason for index, reason in result.bad_frames.items()},
-            left_alone=() if restoration is None else restoration.left_alone,
-            error=result.error,
-            motion=None if result.motion is None else result.motion.to("cpu"),
-            lost_before=result.lost_before,
-            lost_rows={str(index): lost[place] for place, index in enumerate(usable) if place in lost},
-        )

@@ -227,6 +227,7 @@ class VideoMotion:
             frames="restored" if moved else "as taken",
             detection=detection,
             outcome=outcome,
+            verdict="restored rows would shake more than those taken, and are left as taken" if part.is_worse else None,
             bad_frames={str(track.index): track.fault for track in tracks if track.fault is not None},
             left_alone=tuple(left),  # tones are removed as they were measured, whatever explains them
             shaking=shaking,

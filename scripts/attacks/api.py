@@ -153,7 +153,6 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
         "comparison_figure": {"size": 32, "restored": restored[0]},
         "detect_motion": {"iterations": 1},
         "detect_vibration": fast,
-        "iterate_stack": windows,
         "motion_figure": {"motion": vibration, "last": 0.1},
         "process_stack": {"sink": new["new.npy"], **windows},
         "process_video": {"source": video, "sink": new["new.mkv"], "restoration": {"method": "dewarp"}},
@@ -173,8 +172,6 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     }
     functions = {name: getattr(rsv, name) for name in rsv.__all__ if inspect.isfunction(getattr(rsv, name))}
     result = {name: call(function, **different.get(name, {})) for name, function in functions.items()}
-    iterate = functions["iterate_stack"]
-    result["iterate_stack"] = Call(lambda **given: list(iterate(**given)), result["iterate_stack"].arguments)
     result["detect_vibration direct"] = call(rsv.detect_vibration)
     for method in ("phase", "projection"):
         result[f"register_bands {method}"] = call(rsv.register_bands, method=method)

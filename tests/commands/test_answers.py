@@ -81,8 +81,9 @@ def test_the_answer_of_run_names_everything(place, config, tmp_path, capsys, mon
     assumed = " ".join(" ".join(line for line in vibration if not re.match("[xy]:", line)).split())
     assert "assumed: frame_rows, readout direction, scan axis and order of the frames: two frames cannot" in assumed
     assert "assumed: frame_rows=200: if it is stated 1 % too large, this changes x 7" in assumed
-    assert answer["Restoration"][0] == "2 frames restored along x and y"
-    assert re.fullmatch(r"restored frames agree; estimated improvement \+\d+\.\d dB", answer["Restoration"][1])
+    assert re.fullmatch(r"2 frames in 1 window, 1 restored, \S+ s per frame", answer["Restoration"][0])
+    assert re.fullmatch(r"estimated improvement \+\d+\.\d dB", answer["Restoration"][1])
+    assert len(answer["Restoration"]) == 2
     names = " ".join(answer["Files (open before_after.png first)"]).removeprefix("out: ").replace(",", "").split()
     assert sorted(names) == sorted(path.name for path in Path("out").iterdir())
     assert names[0] == "before_after.png"
@@ -99,7 +100,7 @@ def test_an_axis_that_is_left_unchanged_is_named_with_the_reason(place, config, 
     assert "x: reliable" in reasons
     assert "y: not reliable:" in reasons
     assert any("nearly blind" in line for line in reasons)
-    assert answer["Restoration"][0] == "2 frames restored along x"
+    assert answer["Restoration"][0].startswith("2 frames in 1 window, 1 restored")
     assert "y unchanged: its vibration is not reliable, see the reasons above" in answer["Restoration"]
     assert "follow the remedies that the reasons above name" in answer["Next"]
 

@@ -20,8 +20,6 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.report.page import Report, encoded, frames_in_turn, headline, write_report_page
 from rsvib_torch.report.plots import psf_figure
-from rsvib_torch.restoration import RestorationVerdict
-from rsvib_torch.results.reason import Reason
 
 TIMING = SensorTiming(row_time=4e-5, exposure_rows=12, frame_rows=512)
 COMMAND = "rsvib report '<img src=x>.tif' out"
@@ -33,11 +31,6 @@ def result_of(vibration=SHAKE, reliable=(True, True), reasons=((), ())):
     return detections.result_of(vibration, TIMING, 0.001, last_row=240, reliable=reliable, reasons=reasons)
 
 
-def verdict_of(outcome, *reasons):
-    pair, one = torch.zeros(1, 2), torch.full((1,), 3.0)
-    return RestorationVerdict(pair, pair, pair, one, (outcome,), (reasons,))
-
-
 def report_of(**changes):
     scene = resolution_chart(256, 224, sigma=0.7)
     whole = Report(
@@ -47,7 +40,7 @@ def report_of(**changes):
         timing=TIMING,
         restored=scene.expand(2, -1, -1),
         detection=result_of(),
-        verdict=verdict_of("helps"),
+        outcome="helps",
         texts={"Vibration": result_of().summary()},
         next_steps=("Write the restored frames:\n  rsvib run a&b.tif out",),
         made_with=COMMAND,
@@ -92,7 +85,7 @@ def make_page(tmp_path_factory):
 
 def test_page_is_self_contained(page):
     folder, files, reader = page
-    assert files == ["report.html", "details.png", "offsets.png", "psf.png"]
+    assert files == ["report.html", "before_after.png", "offsets.png", "psf.png"]
     assert sorted(files) == sorted(path.name for path in folder.iterdir())
     images = [attributes["src"] for tag, attributes in reader.tags if tag == "img"]
     assert len(images) == 2 + 4 + len(files) - 1
@@ -151,19 +144,19 @@ def test_kernels_are_centred_on_their_rows(motion):
 
 
 @pytest.mark.parametrize(
-    ("reliable", "verdict", "restored", "mark", "sentence"),
+    ("reliable", "outcome", "restored", "mark", "sentence"),
     [
-        ((True, True), verdict_of("helps"), True, "good", "restoration improves the frames"),
-        ((True, False), verdict_of("partly", Reason("no_contrast", "y")), True, "doubt", "removed in part"),
-        ((True, True), verdict_of("unknown", Reason("nothing_undone")), True, "doubt", "not sufficient to determine"),
+        ((True, True), "helps", True, "good", "restoration improves the frames"),
+        ((True, False), "partly", True, "doubt", "removed in part"),
+        ((True, True), "unknown", True, "doubt", "not sufficient to determine"),
         ((True, True), None, True, "doubt", "not sufficient to determine whether"),
-        ((True, True), verdict_of("worse", Reason("no_contrast", "x")), False, "bad", "does not improve the frames"),
+        ((True, True), "worse", False, "bad", "does not improve the frames"),
         ((False, False), None, False, "doubt", "No vibration was found that can be removed"),
-        ((False, False), verdict_of("helps"), True, "bad", "not reliable"),
+        ((False, False), "helps", True, "bad", "not reliable"),
     ],
 )
-def test_headline_matches_the_verdict(reliable, verdict, restored, mark, sentence):
-    report = report_of(detection=result_of(reliable=reliable), verdict=verdict)
+def test_headline_matches_the_verdict(reliable, outcome, restored, mark, sentence):
+    report = report_of(detection=result_of(reliable=reliable), outcome=outcome)
     found = headline(report if restored else replace(report, restored=None))
     assert found[0] == mark
     assert sentence in found[1]
@@ -189,12 +182,10 @@ def test_consecutive_frames_are_shown_at_one_place_of_the_scene():
 
 
 def test_page_without_restoration_has_one_image_of_the_frame(tmp_path):
-    files = write_report_page(
-        tmp_path, report_of(restored=None, verdict=verdict_of("worse", Reason("no_contrast", "x")))
-    )
+    files = write_report_page(tmp_path, report_of(restored=None, outcome="worse"))
     reader = read(tmp_path / "report.html")
     assert "Restoration does not improve the frames; they are unchanged." in "".join(reader.text)
-    assert "details.png" not in files
+    assert "before_after.png" not in files
     assert [attributes["id"] for tag, attributes in reader.tags if tag == "input"] == ["show2"]
     assert sum(tag == "img" for tag, _ in reader.tags) == 1 + 2 + len(files) - 1  # frame, frames in turn, figures
 

@@ -115,7 +115,18 @@ def test_the_answer_about_a_camera_at_rest_is_one_sentence():
     vibration, restoration = manifest_of(*(replace(one, detection=at_rest) for one in still)).lines()
     assert len(vibration) == 1
     assert vibration[0].startswith("no window has a significant tone: the camera stands still")
-    assert restoration == ["0 of 2 windows restored"]
+    assert restoration == []
+
+
+def test_windows_that_restoration_does_not_help_are_named_with_the_first_reason():
+    better = replace(window(0, TWO_TONES), frames="restored", outcome="helps", verdict="restored frames agree")
+    worse = replace(window(1, TWO_TONES), outcome="worse", verdict="restored is no better than raw: noise")
+    manifest = manifest_of(better, worse)
+    (doubt,) = manifest.doubts
+    assert doubt == "improvement not certain in 1 window; in window 1: restored is no better than raw: noise"
+    assert doubt in manifest.lines()[1]
+    assert "1 of 2 windows restored" in manifest.summary()
+    assert manifest_of(better).doubts == []
 
 
 def test_pandas_frame_is_the_table():

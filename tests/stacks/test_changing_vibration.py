@@ -169,7 +169,7 @@ def test_windows_are_measured_with_tones_only_if_options_of_detection_are_given(
     assert report.restored == 0
     (record,) = read_manifest(report.manifest).windows
     assert record.motion is None
-    assert "detect_motion if the vibration changes" in str(record.left_alone[0])
+    assert "detect_motion (rsvib motion) if the vibration changes" in str(record.left_alone[0])
 
 
 @pytest.mark.parametrize("decay", [math.inf, 0.5])

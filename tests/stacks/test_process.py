@@ -12,8 +12,8 @@ from truth import Motion, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
 from rsvib_torch.io import open_stack, write_stack
-from rsvib_torch.options import RestorationOptions
-from rsvib_torch.stacks import cut_windows, read_manifest, restore_trusted
+from rsvib_torch.options import RestorationOptions, StackOptions
+from rsvib_torch.stacks import cut_windows, first_detection, read_manifest, restore_trusted
 from rsvib_torch.stacks.memory import memory_limit
 
 
@@ -78,14 +78,12 @@ def test_output_is_the_same_in_every_format(whole, tmp_path, ending):
     assert {path.name for path in tmp_path.iterdir()} == {sink.name, f"{sink.name}.manifest.json"}
 
 
-def test_iterator_yields_windows_in_order(whole):
+def test_detection_in_the_first_window_has_its_offset_curve(whole):
     options = {name: OPTIONS[name] for name in ("window", "detection", "restoration", "workers")}
-    windows = rsv.iterate_stack(whole / "frames.tif", TIMING, full_scale=4095, **options)
-    first = next(windows)
-    assert first.indices == (0, 1)
-    restored = rsv.read_stack(whole / "out.tif")
-    torch.testing.assert_close(first.frames.clamp(0, 1), restored[:2], atol=0.6 / 4095, rtol=0)
-    assert sum(len(result.indices) for result in windows) == FRAMES - 2
+    found = first_detection(whole / "frames.tif", TIMING, StackOptions(full_scale=4095, **options))
+    stored = read_manifest(whole / "out.tif.manifest.json").windows[0].detection
+    assert torch.equal(found.vibration.amplitude, stored.vibration.amplitude)
+    assert found.offsets.offsets.shape[-1] == 2
     assert not [thread.name for thread in threading.enumerate() if thread.name.startswith("rsvib")]
 
 
