@@ -45,13 +45,7 @@ from rsvib_torch.detection.verdict import contradicted_axes, judged, scene_reaso
 from rsvib_torch.execution.parallel import full_precision, outside_graphs, threads_for, without_gradients
 from rsvib_torch.frames.entry_points import module_options
 from rsvib_torch.frames.pixels import detailed_parts
-from rsvib_torch.frames.prepare import (
-    GreyFrames,
-    PreparedFrames,
-    frames_from_row_order,
-    prepare_frames,
-    without_mosaic,
-)
+from rsvib_torch.frames.prepare import GreyFrames, PreparedFrames, frames_from_row_order, prepare_frames, without_mosaic
 from rsvib_torch.motion.timing import MAX_SPAN, SensorTiming, check_timing, contradiction
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.numerics.tables import Array, table, tables, tensor

@@ -317,10 +317,6 @@ class WindowFit:
         other.solve(ROUNDS)
         return other if np.median(other.distance) < _EXPLAINS_MORE * np.median(self.distance) else self
 
-    def has_blind_tone(self) -> bool:
-        """Whether the frequency of a tone has been corrected to one that frames do not show."""
-        return any(_gain(tone.frequency, self.interval) < _MIN_GAIN for tone in self.tones if abs(tone.slope) <= _FAST)
-
     def keep_tones(self) -> None:
         """Leave out insignificant tones, and those that thirds of the rows or columns contradict."""
         waves, residual = [], self.corners.offsets - self.explained(self.knots)
@@ -501,9 +497,9 @@ def fit_window(
         best, *_ = fit.with_aliases(axis, frequency, slope, limits)
         found = {of: value for of, value in found.items() if of[0] != axis}
         best.solve()
-        if best.has_blind_tone():
-            # A part of the picture that moves by itself displaces the same rows again and again: without vibration, it
-            # became tones of up to 70 px at the frame rate.
+        if any(_gain(tone.frequency, interval) < _MIN_GAIN for tone in best.tones if abs(tone.slope) <= _FAST):
+            # It has been corrected to a frequency that frames do not show. A part of the picture that moves by itself
+            # displaces the same rows again and again: without vibration, it became tones of up to 70 px.
             blind = round(frequency * interval) / interval
             step = frequencies[1] - frequencies[0]
             left_out[axis] |= np.abs(frequencies - blind) <= abs(frequency - blind) + step

@@ -58,6 +58,8 @@ class WindowTone:
         frequency = self.frequency + self.slope * time
         turns = frequency * origin - 0.5 * self.slope * time**2
         turned = (factors * self.knots[index]).sum() * np.exp(2j * math.pi * turns)
+        if frequency < 0:  # a tone that has swept through 0 Hz; Re c exp(i a) = Re c* exp(-i a)
+            frequency, turned = -frequency, turned.conjugate()
         # What a spline does not follow: behind a blow that decays with 0.1 s, amplitudes were wrong by 6 to 20 std.
         bent = self.bend(slice(index.min(), index.max() + 1))
         bent = math.sqrt(max(bent**2 - 0.375 * min(self.amplitude_std, 1e9) ** 2, 0.0))  # without that of noise

@@ -72,14 +72,8 @@ def part_detection(frames: VideoFrames, path: CameraPath, times: Array, part: sl
         findings = tuple((*(one for one in of if one.code != "no_tone"), *against) for of in findings)
     timing, std = frames.job.timing, VibrationStd(*(torch.from_numpy(np.array(value)) for value in values))
     coefficients = amplitude * np.exp(1j * (phase - 0.5 * math.pi))
-    fit = ToneFit(
-        coefficients=coefficients[None],
-        frequencies=frequency[None],
-        active=amplitude[None] > 0,
-        drift=velocity[None, :, None],
-        covariance=np.empty((1, 0, 0)),
-        centre=np.zeros(1),
-    )
+    drift, no_covariance = velocity[None, :, None], np.empty((1, 0, 0))
+    fit = ToneFit(coefficients[None], frequency[None], amplitude[None] > 0, drift, no_covariance, np.zeros(1))
     rows = frames.size[int(timing.scan_axis)]
     sensitivity = timing_sensitivity(fit, timing.in_row_order(), len(of_part), rows)[0]
     return DetectedVibration(

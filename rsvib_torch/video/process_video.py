@@ -44,21 +44,18 @@ _OF_GYROSCOPE = ("orientation", "offset", "offset_std", "scale", "bias", "focal_
 def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, options: ProcessVideoOptions) -> StackReport:
     """Restore a video of any length from file to file, and steady it.
 
-    The video is read twice. The first pass follows corners from frame to frame and fits, in overlapping windows of 96
-    frames, the path of the camera (x, y, roll, zoom) and the tones of its vibration, each corner at the time of its
-    row: hands, pans, parallax and moving objects do not disturb them. Tones that sweep are followed in windows of 24
-    frames, where others leave more than 0.3 px. The second pass restores the frames: tones, and with ``steady`` also
-    the skew and wobble by the path, are undone, and the frames are moved to a smooth path. With ``gyroscope``, corners
-    of 48 pairs of frames align its rates as in ``align_motion``, and the path is the rotation of the camera with the
-    vibration that the gyroscope resolves; no tones are fitted. Of 4:2:0 videos, luma is restored with the method, and
-    chroma with ``"dewarp"``; H.264 gets 8 of 10 bits. The track of a GoPro video replaces the exposure of ``timing``
-    (``SHUT``); if it states that the camera has stabilised the images (``IORI``), they are moved as a whole.
+    The video is read twice. The first pass follows corners, each at the time of its row, and fits the path of the
+    camera (x, y, roll, zoom) and the tones of its vibration in overlapping windows of 96 frames, or of 24 frames where
+    tones sweep. The second pass undoes the tones and, with ``steady``, the skew and wobble by the path, and moves the
+    frames to a smooth path. With ``gyroscope``, the path is the rotation that it recorded, aligned as in
+    ``align_motion``, and no tones are fitted. Of 4:2:0 videos, luma is restored with the method, and chroma with
+    ``"dewarp"``; H.264 gets 8 of 10 bits. The track of a GoPro video replaces the exposure of ``timing`` (``SHUT``); if
+    it states that the camera has stabilised the images (``IORI``), they are moved as a whole.
 
-    Of a part of 32 frames whose first eight would shake more than as taken, rows are not moved apart: no vibration, and
-    with ``steady`` no wobble, is undone. Frames that cannot be decoded and constant frames are replaced by the frame
-    before (at the beginning of a part by the one behind them); copies of the frame before are moved along the smooth
-    path. Parts are encoded in the folder ``.NAME.rsvib``, from which an interrupted run is resumed. A video whose
-    corners shake more in the restored frames than in those of the input is not written.
+    Of a part of 32 frames whose first eight would shake more than as taken, rows are not moved apart. Frames that
+    cannot be decoded and constant frames are replaced by the frame before (at the beginning of a part by the one behind
+    them); copies of the frame before are moved along the smooth path. Parts are encoded in the folder ``.NAME.rsvib``,
+    from which an interrupted run is resumed. A video whose corners would shake more than in the input is not written.
 
     Args:
         source: A video, or another stack as in ``read_stack``.

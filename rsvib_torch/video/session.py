@@ -348,11 +348,7 @@ class _AbandonedError(Exception):
     """An output has taken no frames for too long after a signal."""
 
 
-def run_live(
-    source: FrameSource,
-    tracker: VibrationTracker,
-    outputs: Sequence[FrameOutput],
-) -> LiveReport:
+def run_live(source: FrameSource, tracker: VibrationTracker, outputs: Sequence[FrameOutput]) -> LiveReport:
     """Track the frames of a source, and write the restored ones, until the source ends or a signal arrives.
 
     If processing is too slow for a source that does not wait, the motion of late frames is predicted instead of

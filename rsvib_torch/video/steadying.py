@@ -45,11 +45,7 @@ _HALVINGS = 5  # of the time over which the path is averaged, where the frame wo
 
 
 def steady_shifts(
-    times: Array,
-    apart: Callable[[int, slice], Array],
-    duration: float,
-    size: tuple[int, int],
-    limit: float,
+    times: Array, apart: Callable[[int, slice], Array], duration: float, size: tuple[int, int], limit: float
 ) -> Array:
     """(N, 4), places of a camera less those of a smooth path along its path, which keeps slow motion.
 

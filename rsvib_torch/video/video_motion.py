@@ -144,7 +144,11 @@ class VideoMotion:
         is_worse = any(shakes_more(*both) for both in shaking.values()) if shaking else not self.is_explained(number)
         if not is_worse or not isinstance(self.path, CameraPath):
             return VideoPart(number, tracks, shaking)
-        tracks = [_left_alone(track) for track in tracks]
+        tracks = [  # rows are not moved apart
+            replace(track, motion=replace(track.motion.scaled(0.0), image_shift=track.motion.image_shift))
+            for track in tracks
+            if isinstance(track.motion, Vibration)
+        ]
         return VideoPart(number, tracks, self._shaking(tracks), is_worse=True)
 
     def is_explained(self, part: int) -> bool:
@@ -309,10 +313,3 @@ def _check_repetitions(repetitions: dict[int, Array | None], places: Array) -> N
 def shakes_more(before: float, after: float) -> bool:
     """Whether frames shake visibly more, by rms motions in px, than before."""
     return after > _MORE_SHAKING * before + _VISIBLE_SHAKING
-
-
-def _left_alone(track: FrameTrack) -> FrameTrack:
-    """What is removed from a frame of a part that restoration makes worse: rows are not moved apart."""
-    if not isinstance(track.motion, Vibration):
-        return track
-    return replace(track, motion=replace(track.motion.scaled(0.0), image_shift=track.motion.image_shift))

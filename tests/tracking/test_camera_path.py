@@ -10,6 +10,7 @@ from truth import draw_scene
 from rsvib_torch import SensorTiming, calibrate_row_time_by_motion
 from rsvib_torch.registration.corners import CornerFollower, Corners
 from rsvib_torch.tracking.camera_path import camera_path, shake
+from rsvib_torch.tracking.window_tones import WindowTone
 from rsvib_torch.video.steadying import largest_displacement, steady_shifts
 
 HEIGHT, WIDTH, COUNT, RATE, SAMPLES = 216, 288, 48, 30.0, 3
@@ -349,3 +350,13 @@ def test_a_single_tone_does_not_determine_the_row_time():
     frames = np.stack([map_coordinates(scene, place, order=3, prefilter=False, mode="nearest") for place in at])
     found = calibrate_row_time_by_motion(np.clip(frames, 0, 1).astype(np.float32), frame_rate=RATE)
     assert not found.reliable
+
+
+def test_a_tone_that_sweeps_through_zero_has_a_positive_frequency_and_the_same_displacement():
+    knots = np.full(8, 1.5 - 0.7j)
+    tone = WindowTone(axis=0, frequency=12.0, knots=knots, start=-0.5, step=0.2, slope=-30.0)
+    times = 0.49 + np.linspace(-0.005, 0.005, 5)
+    now = tone.at(0.49, 0.0)  # 12 Hz - 30 Hz/s 0.49 s = -2.7 Hz; phases count from the middle of the window
+    displaced = (now.coefficient * np.exp(2j * np.pi * now.frequency * times)).real
+    assert now.frequency == pytest.approx(2.7)
+    assert displaced == pytest.approx((knots[0] * tone.waves(times, ())).real, abs=0.02)
