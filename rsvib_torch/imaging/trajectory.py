@@ -69,11 +69,7 @@ def exposure_trajectory(
 
 
 def rows_showing(
-    scene_rows: Tensor,
-    frame_start: Tensor,
-    timing: RowTiming,
-    vibration: Motion,
-    exposure_time: Tensor | None = None,
+    scene_rows: Tensor, frame_start: Tensor, timing: RowTiming, vibration: Motion, exposure_time: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Frame rows r(s) that show scene rows s of shape S, and their mean displacement (S, 2) in px, float64.
 
