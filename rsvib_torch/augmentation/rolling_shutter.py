@@ -19,7 +19,7 @@ from rsvib_torch.checks.values import MAX_NUMBER, check_choice, check_number, ch
 from rsvib_torch.execution.parallel import full_precision
 from rsvib_torch.files.reading import Table
 from rsvib_torch.frames.prepare import frames_from_row_order, frames_to_row_order
-from rsvib_torch.imaging import blur_rows, gauss_node_count, trajectory_psf
+from rsvib_torch.imaging import blur_rows, gauss_node_count, rows_showing, trajectory_psf
 from rsvib_torch.imaging.blur import Interpolation
 from rsvib_torch.motion.timing import RowTiming, SensorTiming, check_timing
 from rsvib_torch.motion.vibration import Vibration
@@ -41,21 +41,11 @@ class ImageMotion:
     timing: RowTiming  # the sensor; its exposure is not used
     size: tuple[int, int]  # (rows, columns) of the images
 
-    def mean_displacement(self, rows: Tensor) -> Tensor:
-        """Mean displacement (B, S, 2) in px over the exposures of frame rows (B, S) (Eq. 2)."""
-        starts = self.starts[:, None] + rows * self.timing.row_time
-        return self.vibration.mean_displacement(starts, self.exposure_time[:, None])
-
     def move(self, points: Tensor) -> Tensor:
-        """Positions (x, y) in the frame of scene points (B, S, 2) in px, by Newton's method for their rows."""
-        rows, exposure = points[..., 1], self.exposure_time[:, None]
-        for _ in range(8):
-            residual = points[..., 1] + self.mean_displacement(rows)[..., 1] - rows
-            starts = self.starts[:, None] + rows * self.timing.row_time
-            begin, end = (self.vibration.displacement(times)[..., 1].detach() for times in (starts, starts + exposure))
-            slope = (end - begin) * self.timing.row_time / exposure
-            rows = rows + residual / (1.0 - slope).clamp(min=0.1)
-        return torch.stack([points[..., 0] + self.mean_displacement(rows)[..., 0], rows], -1)
+        """Positions (x, y) in the frame of scene points (B, S, 2) in px."""
+        start, exposure = self.starts[:, None], self.exposure_time[:, None, None]
+        rows, moved = rows_showing(points[..., 1], start, self.timing, self.vibration, exposure)
+        return torch.stack([points[..., 0] + moved[..., 0], rows], -1)
 
     @full_precision
     def move_images(self, images: Tensor, interpolation: Interpolation) -> Tensor:
@@ -73,10 +63,12 @@ class ImageMotion:
 
     def move_masks(self, masks: Tensor) -> Tensor:
         """Labels (B, C, R, W) moved by the mean displacement of their rows, to the nearest pixel."""
-        B, C, R, W = masks.shape
+        _, C, R, W = masks.shape
         rows = torch.arange(R, dtype=torch.float64, device=masks.device)
         columns = torch.arange(W, dtype=torch.float64, device=masks.device)
-        x, y = self.mean_displacement(rows.expand(B, -1))[..., None].unbind(-2)  # (B, R, 1)
+        starts = self.starts[:, None] + rows * self.timing.row_time
+        moved = self.vibration.mean_displacement(starts, self.exposure_time[:, None])
+        x, y = moved[..., None].unbind(-2)  # (B, R, 1)
         source_rows = mirrored((rows[:, None] - y).round().to(torch.int64), R)
         source_columns = mirrored((columns - x).round().to(torch.int64), W)
         index = (source_rows * W + source_columns).flatten(1)[:, None].expand(-1, C, -1)

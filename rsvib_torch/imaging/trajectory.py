@@ -69,7 +69,7 @@ def exposure_trajectory(
 
 
 def rows_showing(
-    scene_rows: Tensor, frame_start: Tensor, timing: RowTiming, vibration: Motion
+    scene_rows: Tensor, frame_start: Tensor, timing: RowTiming, vibration: Motion, exposure_time: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Frame rows r(s) that show scene rows s of shape S, and their mean displacement (S, 2) in px, float64.
 
@@ -77,14 +77,15 @@ def rows_showing(
     Row r is exposed from ``frame_start + r T_row`` on, and Y is the mean displacement over that exposure (Eq. 2).
     Newton's method; ``|dY/dt| T_row`` is 0.02 for 5 px at 30 Hz, and must stay below 1: content that moves along the
     scan as fast as the rows is never passed. The vibration is in row order, its batch dimensions lead; ``frame_start``
-    in s broadcasts to S.
+    in s broadcasts to S, and other exposures in s than that of the sensor to (S, 1).
     """
     check_two_axes(vibration, "the displacement of a row")
     scene_rows, frame_start = scene_rows.to(torch.float64)[..., None], frame_start[..., None]
     rows, known_slope = scene_rows + torch.zeros_like(frame_start), None
     near = torch.tensor([-1e-3, 0.0, 1e-3], dtype=torch.float64, device=rows.device)  # rows, for the derivative
+    exposure = timing.exposure_time if exposure_time is None else exposure_time
     for _ in range(8):
-        of_near = vibration.mean_displacement(frame_start + (rows + near) * timing.row_time, timing.exposure_time)
+        of_near = vibration.mean_displacement(frame_start + (rows + near) * timing.row_time, exposure)
         displacement, slope = of_near[..., 1, :], (of_near[..., 2, :] - of_near[..., 0, :]) / 2e-3
         # the limit keeps steps finite near slope 1
         step = (scene_rows + displacement[..., 1:] - rows) / (1.0 - slope[..., 1:].detach()).clamp(min=0.1)
@@ -93,8 +94,7 @@ def rows_showing(
         if known_slope is not None and bool(((slope - known_slope) * step).abs().amax() < 2e-5):
             break
         known_slope = slope
-    rows = rows[..., 0]
-    return rows, displacement
+    return rows[..., 0], displacement
 
 
 # Columns at which displacements that differ along a row are computed; a polynomial interpolates them. Without a camera,
