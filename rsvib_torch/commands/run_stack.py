@@ -214,7 +214,7 @@ def _describe_video(answer: Answer, stored: stacks.StackManifest, result: stacks
     """Add what was found in a video to the answer, and warn of frames that are not better."""
     if result.bad_frames:
         bad = number_of(result.bad_frames, "frame")
-        warn(f"{bad} could not be used and repeat the frame before: see manifest.json")
+        warn(f"{bad} could not be used; the frame before is shown instead: see manifest.json")
     if not result.restored:
         warn("no vibration was found that can be removed: the frames are written unchanged")
     if stored.settings["video"].get("stabilised"):

@@ -38,10 +38,7 @@ def required_full_scale(full_scale: object, dtype: np.dtype, name: object) -> fl
         raise TypeError(f"{name} must be real numbers, got {dtype}; pass {name}.float()")
     known = known_full_scale(dtype, full_scale)
     if known is None:
-        raise ValueError(
-            f"{name}: full scale of {dtype} frames unknown: pass full_scale, e.g. full_scale=4095 for 12-bit counts "
-            "(commands: --full-scale 4095)"
-        )
+        raise ValueError(f"{name}: full scale of {dtype} frames unknown: pass full_scale, e.g. 4095 for 12-bit counts")
     return known
 
 

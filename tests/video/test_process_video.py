@@ -317,7 +317,7 @@ def test_wrong_arguments_are_refused_before_anything_is_written(clip, tmp_path):
     cases = [
         ({"border": "zoom"}, "border must be 'mirror'"),
         ({"steady": -1.0}, "steady must be at least 0"),
-        ({"restoration": {"joint": 3}}, "joint is not available for frames that are followed one by one"),
+        ({"restoration": {"joint": 3}}, "joint must be left out where frames are followed one by one"),
         ({"restoration": {"method": "exact", "half_rows": 3}}, "half_rows is no option of"),
         ({"border": "crop", "steady": 60.0, "memory": "1kB"}, "memory of"),
     ]
