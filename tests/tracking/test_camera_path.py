@@ -272,7 +272,7 @@ def test_a_lamp_that_flickers_is_no_vibration():
 def test_a_vibration_faster_than_the_exposure_is_found():
     """Its mean over 1/60 s is a fifth of the amplitude, with the opposite sign."""
     timing = SensorTiming(row_time=90e-6, exposure_rows=1 / 60 / 90e-6, frame_rows=1 / RATE / 90e-6)
-    frames = recorded({0: (3.0, 87.0, 0.3)}, subject=False, timing=timing, samples=6, count=30)
+    frames = recorded({0: (3.0, 87.0, 0.3)}, subject=False, timing=timing, samples=8, count=30)
     (tone,) = fitted(frames, timing)[1].tones(0.0)
     assert tone.axis == 0
     assert tone.frequency == pytest.approx(87.0, abs=0.1)
