@@ -20,8 +20,10 @@ RENDERED = {"report", "test_presentation.py", "test_docs.py", "test_spectrum.py"
 LONGEST = (
     "test_tutorials.py",
     "test_changing_vibration.py",
-    "test_start.py",
     "test_camera_path.py",
+    "test_diagnosis.py",
+    "test_verdict.py",
+    "test_all_functions.py",
     "test_process_video.py",
     "test_direct.py",
     "test_mosaic.py",

@@ -91,7 +91,7 @@ def rows_showing(
         step = (scene_rows + displacement[..., 1:] - rows) / (1.0 - slope[..., 1:].detach()).clamp(min=0.1)
         rows, displacement = rows + step, displacement + slope * step
         # px, what the next step would change is less than half of the change of the slope times this step
-        if known_slope is not None and bool(((slope - known_slope) * step).abs().amax() < 2e-5):
+        if known_slope is not None and bool((((slope - known_slope) * step).abs() < 2e-5).all()):
             break
         known_slope = slope
     return rows[..., 0], displacement

@@ -177,7 +177,7 @@ def warn_of_mosaic(frames: PreparedFrames) -> None:
     if frames.colours is None and frames.images.shape[2] == 1 and bool(are_mosaics(frames.filled[:1, 0, 0])[0]):
         warn_of_restoration(
             "frames are raw frames of a colour sensor, whose colours are mixed if they are restored as grey frames: "
-            'state the pattern, e.g. mosaic="RGGB" (commands: --mosaic RGGB)'
+            'state the pattern, e.g. mosaic="RGGB" (--mosaic RGGB)'
         )
 
 

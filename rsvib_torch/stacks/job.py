@@ -217,7 +217,7 @@ def _given(
     if motion.start > motion.spacing or motion.end < starts[-1] + readout - motion.spacing:
         raise ValueError(
             f"motion covers {motion.start:.6g} to {motion.end:.6g} s on the clock of the frames, the frames need 0 to "
-            f"{starts[-1] + readout:.6g} s; check its offset, motion.retimed(offset) (commands: --offset)"
+            f"{starts[-1] + readout:.6g} s; check its offset: motion.retimed(seconds), or --offset"
         )
     ends = [(starts[window.first], starts[window.last]) for window in windows]
     parts = [motion.within(first - readout, last + 2 * readout).retimed(first) for first, last in ends]

@@ -171,7 +171,10 @@ def _planned(source: Path, sink: Path, timing: SensorTiming, options: ProcessVid
     given = options.restoration or {}
     for name in _TOGETHER:
         if given.get(name) is True or given.get(name) not in (None, False, 1):
-            raise ValueError(f"{name} is not available for frames that are followed one by one; use windows instead")
+            raise ValueError(
+                f"{name} must be left out where frames are followed one by one; use process_stack "
+                "(rsvib run without --video)"
+            )
     given = {name: value for name, value in given.items() if name not in _TOGETHER}
     resources = {name: getattr(options, name) for name in fields_of(ResourceOptions)}
     job, _, at_once = plan_job(source, timing, StackOptions(restoration=given, window=2, **resources))

@@ -5,7 +5,6 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 from attacks.small_runs import FORMATS, Child, Reference, completed_or_refused, content, in_turn, process
 from attacks.trial import Trial
@@ -14,17 +13,17 @@ from attacks.trial import Trial
 _READ_AT_ALL_TIMES = ("TIFF", "TIFF, zlib", "npy", "HDF5", "video")
 
 
-def _run(source: Path, sink: Path, options: dict[str, Any], delay: float) -> None:
+def _run(source: Path, sink: Path, delay: float) -> None:
     time.sleep(delay)
-    process(source, sink, resume=True, **options)
+    process(source, sink, resume=True)
 
 
 def _three_runs(reference: Reference, kind: str, place: Path, choice: random.Random) -> Trial:
     """Three processes begin after random delays."""
-    name, options = FORMATS[kind]
+    name = FORMATS[kind]
     whole = content(reference.whole / name)
     delays = [choice.uniform(0.0, 0.3) for _ in range(3)]
-    children = [Child(_run, reference.source, place / name, options, delay) for delay in delays]
+    children = [Child(_run, reference.source, place / name, delay) for delay in delays]
     incomplete, end = "", time.monotonic() + 120.0
     while any(child.runs for child in children) and time.monotonic() < end:
         if kind in _READ_AT_ALL_TIMES and (place / name).exists() and content(place / name) != whole:
@@ -40,13 +39,13 @@ def _three_runs(reference: Reference, kind: str, place: Path, choice: random.Ran
 
 def _replaced_folder(reference: Reference, kind: str, place: Path, choice: random.Random) -> Trial:
     """The work folder is renamed during the run, and a link to a folder of the user takes its name."""
-    name, options = FORMATS[kind]
+    name = FORMATS[kind]
     out, user, moment = place / "out", place / "user", choice.uniform(0.02, 0.4)
     user.mkdir()
     for precious in ("settings.json", "000000.npy", name):
         (user / precious).write_bytes(b"precious")
     before, work = content(user), out / f".{name}.rsvib"
-    child = Child(process, reference.source, out / name, **options)
+    child = Child(process, reference.source, out / name)
     while not work.exists() and child.runs:
         time.sleep(0.001)
     time.sleep(moment)

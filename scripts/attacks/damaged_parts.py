@@ -84,7 +84,7 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
     """Kinds of damage take turns, on other formats and files each time."""
     reference, choice, damages = Reference(folder / "reference"), random.Random(seed), _DAMAGES | _REPLACED
     for number, kind, place in in_turn(folder, count):
-        damage, out, name = list(damages)[number % len(damages)], place / "out", FORMATS[kind][0]
+        damage, out, name = list(damages)[number % len(damages)], place / "out", FORMATS[kind]
         kill_run(reference, out, kind, choice, windows=2)
         (place / _USER).mkdir()
         for of_user in ("settings.json", "000000.npy", name):
@@ -96,7 +96,7 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
             path = work
         damages[damage](path, data, at)
         before, precious = _listing(place), content(place / _USER)
-        code, result = fork(resume, reference.source, out / name, FORMATS[kind][1])
+        code, result = fork(resume, reference.source, out / name)
         difference = reference.difference(out, name) if code == 0 else ""
         trial = completed_or_refused(f"{kind}: {path.name}, {damage}, at byte {at}", code, result, difference)
         if content(place / _USER) != precious:

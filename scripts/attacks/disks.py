@@ -32,7 +32,7 @@ def _mount(disk: Path) -> None:
 def _attempt(reference: Reference, disk: Path, kind: str, pages: int) -> str:
     """Message of a run with a number of free pages; resumed when there is space, its result must be right."""
     _mount(disk)
-    name, options = FORMATS[kind]
+    name = FORMATS[kind]
     sink, ballast, free = disk / "new" / name, disk / "ballast", os.statvfs(disk).f_bavail
     ballast.write_bytes(b"b" * (_PAGE * (free - pages)))
     assert abs(os.statvfs(disk).f_bavail - pages) <= 1
@@ -40,14 +40,14 @@ def _attempt(reference: Reference, disk: Path, kind: str, pages: int) -> str:
         subprocess.run(["mount", "-o", "remount,ro", disk], check=True)
     message = ""
     try:
-        process(reference.source, sink, **options)
+        process(reference.source, sink)
     except OSError as error:
         message = str(error)
     assert not (message and sink.exists()), "an incomplete output has its name"
     if pages == 0:
         subprocess.run(["mount", "-o", "remount,rw", disk], check=True)
     ballast.unlink()
-    resume(reference.source, sink, options)
+    resume(reference.source, sink)
     difference = reference.difference(sink.parent, name)
     assert not difference, difference
     return message

@@ -39,7 +39,7 @@ _KEPT = ("all", "no", "some")  # later changes
 _FRAMES = "frames"  # name of the file with the number of frames that a run has reported as complete
 
 
-def _recorded_run(source: Path, sink: Path, options: dict[str, Any], root: Path, records: Path, die_at: int) -> int:
+def _recorded_run(source: Path, sink: Path, root: Path, records: Path, die_at: int) -> int:
     """Process the stack; record what is synchronised below ``root``, and die at a call."""
     opened: dict[int, int] = {}  # open files, so that their numbers are not given to other files
 
@@ -64,7 +64,7 @@ def _recorded_run(source: Path, sink: Path, options: dict[str, Any], root: Path,
     names = {entry.name: (entry.inode(), entry.is_dir()) for entry in os.scandir(root)}
     (records / f"{root.stat().st_ino}.names").write_text(json.dumps(names))
     done = count_file_calls(die_at, record)
-    process(source, sink, **options, progress=lambda frames, _: (records / _FRAMES).write_text(str(frames)))
+    process(source, sink, resume=True, progress=lambda frames, _: (records / _FRAMES).write_text(str(frames)))
     return done[0]
 
 
@@ -127,7 +127,7 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
     """The formats take turns; every other run that keeps all changes is killed twice."""
     reference, choice = Reference(folder / "reference"), random.Random(seed)
     for number, kind, place in in_turn(folder, count):
-        name, options = FORMATS[kind]
+        name = FORMATS[kind]
         root, records, after = place / "disk", place / "records", place / "after"
         for path in (root, records):
             path.mkdir()
@@ -137,7 +137,7 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
             call, moment = choice.randint(1, calls_of(reference, kind)), choice.uniform(0.0, _LONGEST)
             ends.append(f"after {moment:.4f} s" if by_time else f"at call {call}")
             arguments = (root, records, 0 if by_time else call)
-            run = Child(_recorded_run, reference.source, root / "new" / name, {**options, "resume": True}, *arguments)
+            run = Child(_recorded_run, reference.source, root / "new" / name, *arguments)
             code, result = run.ended(moment if by_time else LIMIT)
         title, left = f"{kind}, {' and '.join(ends)}, {kept} later changes", root
         if code in (1, 2):
@@ -152,7 +152,7 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
             continue
         frames = (records / _FRAMES).read_text() if (records / _FRAMES).exists() else ""
         finished = int(frames or 0) // ((FRAMES - 1) // WINDOWS)  # the last window has one more frame
-        code, result = fork(resume, reference.source, sink, options)
+        code, result = fork(resume, reference.source, sink)
         difference = reference.difference(sink.parent, name) if code == 0 else ""
         trial = completed_or_refused(title, code, result, difference)
         if trial.outcome == "refused" or (trial.outcome == "completed" and result < finished):

@@ -27,13 +27,7 @@ from rsvib_torch.stacks import read_manifest
 FRAMES, SIZE, WINDOW = 13, 64, 3
 TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=72)
 WINDOWS = 6
-FORMATS: dict[str, tuple[str, dict[str, Any]]] = {
-    "TIFF": ("out.tif", {}),
-    "npy": ("out.npy", {}),
-    "HDF5": ("out.h5", {}),
-    "PNG folder": ("frames", {}),
-    "video": ("out.mkv", {}),
-}
+FORMATS = {"TIFF": "out.tif", "npy": "out.npy", "HDF5": "out.h5", "PNG folder": "frames", "video": "out.mkv"}
 _CALLS = ("write", "pwrite", "replace", "fsync", "fdatasync", "ftruncate", "unlink", "mkdir", "rmdir", "rename")
 LIMIT = 100.0  # s for one run, which takes less than one on an idle machine
 
@@ -74,8 +68,8 @@ def _prepare(folder: Path) -> None:
     write_tiff(source, vibrating_counts(TIMING, FRAMES, (SIZE, SIZE), seed=2))
     manifest = folder / "vibrations.json"
     process(source, folder / "first.npy", given=None, detection=DETECTION, manifest=manifest)
-    for name, options in FORMATS.values():
-        report = process(source, folder / "whole" / name, **options)
+    for name in FORMATS.values():
+        report = process(source, folder / "whole" / name)
         assert (report.frames, report.windows) == (FRAMES, WINDOWS)
         assert report.restored > 0
 
@@ -96,15 +90,11 @@ class Reference:
             return "the output is missing"
         if content(folder / name) != content(self.whole / name):
             return "the output differs from that of an uninterrupted run"
-        manifest, companion = f"{name}.manifest.json", f"{name}.json"
+        manifest = f"{name}.manifest.json"
         records = [path / manifest for path in (folder, self.whole)]
         if not records[0].exists() or len({json.dumps(json.loads(path.read_text())) for path in records}) > 1:
             return "the manifest differs"
         extra = {path.name for path in folder.iterdir()} - {name, manifest}
-        if (self.whole / companion).exists():
-            extra -= {companion}
-            if (folder / companion).read_bytes() != (self.whole / companion).read_bytes():
-                return f"{companion} differs"
         return f"files are left: {', '.join(sorted(extra))}" if extra else ""
 
 
@@ -192,16 +182,16 @@ def count_file_calls(die_at: int, after: Callable[[str, Any], None] | None = Non
     return done
 
 
-def counted_run(source: Path, sink: Path, options: dict[str, Any], die_at: int) -> int:
+def counted_run(source: Path, sink: Path, die_at: int) -> int:
     """Process the stack, and die at a call; returns the number of calls."""
     done = count_file_calls(die_at)
-    process(source, sink, **options)
+    process(source, sink)
     return done[0]
 
 
-def resume(source: Path, sink: Path, options: dict[str, Any]) -> int:
+def resume(source: Path, sink: Path) -> int:
     """Resume a run; returns the number of windows that were complete before."""
-    resumed: int = process(source, sink, resume=True, **options).resumed
+    resumed: int = process(source, sink, resume=True).resumed
     return resumed
 
 
@@ -217,10 +207,9 @@ def in_turn(folder: Path, count: int) -> Iterator[tuple[int, str, Path]]:
 @functools.cache
 def calls_of(reference: Reference, kind: str) -> int:
     """Number of calls of an uninterrupted run that change files."""
-    name, options = FORMATS[kind]
     folder = reference.whole.with_name("counted")
     folder.mkdir(exist_ok=True)
-    code, calls = fork(counted_run, reference.source, folder / name, options, 0)
+    code, calls = fork(counted_run, reference.source, folder / FORMATS[kind], 0)
     assert code == 0, calls
     return int(calls)
 
@@ -233,12 +222,12 @@ def finished_windows(folder: Path, name: str) -> int:
 
 def kill_run(reference: Reference, folder: Path, kind: str, choice: random.Random, *, windows: int) -> None:
     """A folder with a run that was killed after at least a number of windows."""
-    name, options = FORMATS[kind]
+    name = FORMATS[kind]
     while True:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir()
         die_at = choice.randint(1, calls_of(reference, kind))
-        fork(counted_run, reference.source, folder / name, options, die_at)
+        fork(counted_run, reference.source, folder / name, die_at)
         if finished_windows(folder, name) >= windows:
             return
 

@@ -52,8 +52,9 @@ def run_watched(command: Sequence[str], *, limit: float, folder: Path) -> Proces
         tree, peak = psutil.Process(child.pid), 0
         while child.poll() is None and time.perf_counter() - begin < limit:
             with contextlib.suppress(psutil.NoSuchProcess):  # of a process that has ended since it was listed
-                processes = [tree, *tree.children(recursive=True)]
-                peak = max(peak, sum(member.memory_info().rss for member in processes))
+                # a child that has not started its own program yet shares the memory of its parent
+                others = [one for one in tree.children(recursive=True) if one.cmdline() != tree.cmdline()]
+                peak = max(peak, sum(member.memory_info().rss for member in [tree, *others]))
             time.sleep(0.02)
         expired = child.poll() is None
         if expired:

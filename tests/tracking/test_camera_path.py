@@ -13,7 +13,7 @@ from rsvib_torch.tracking.camera_path import camera_path, shake
 from rsvib_torch.tracking.window_tones import WindowTone
 from rsvib_torch.video.steadying import largest_displacement, steady_shifts
 
-HEIGHT, WIDTH, COUNT, RATE, SAMPLES = 216, 288, 48, 30.0, 3
+HEIGHT, WIDTH, COUNT, RATE, SAMPLES = 216, 288, 36, 30.0, 3
 TIMING = SensorTiming(row_time=90e-6, exposure_rows=20, frame_rows=1 / RATE / 90e-6)
 TONES = {0: (1.2, 93.0, 0.3), 1: (0.8, 71.0, 1.0)}  # axis: px, Hz, rad
 
@@ -208,8 +208,8 @@ def test_a_vibration_of_the_zoom_is_no_tone_along_x():
     assert all(tone.axis == 1 and tone.apart > 0.25 for tone in tones)  # refused: the halves move apart
 
 
-@pytest.mark.parametrize("rate", [1000.0, 5000.0])
-@pytest.mark.parametrize("wobble", [0.0, 0.6])  # px, of corners that move by themselves: other readouts are tried
+# a wobble in px of corners that move by themselves: other readouts are tried
+@pytest.mark.parametrize(("rate", "wobble"), [(1000.0, 0.6), (5000.0, 0.0), (5000.0, 0.6)])
 def test_tones_of_fast_cameras_are_found(rate, wobble):
     """Up to 2000 Hz were searched: two other tones were found at 1000 frames per second, and 5000 ended in an error."""
     frequency, random, height, width = 2.3 * rate, np.random.default_rng(1), 240, 320
@@ -289,7 +289,7 @@ def test_a_vibration_faster_than_the_exposure_is_found():
     ],
 )
 def test_tones_that_decay_or_sweep_are_followed(truth, decay, sweep, times, error):
-    path = fitted(recorded(truth, subject=False, decay=decay, sweep=sweep))[1]
+    path = fitted(recorded(truth, subject=False, decay=decay, sweep=sweep, count=48))[1]
     assert all(window.residual < path.allowed for window in path.windows)
     for time in times:
         for axis, (size, frequency, phase) in truth.items():
