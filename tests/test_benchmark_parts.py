@@ -1,5 +1,6 @@
 """The parts of the benchmark at small sizes: figures are plausible and consistent, independent of the speed."""
 
+import json
 import math
 from pathlib import Path
 
@@ -39,3 +40,25 @@ def test_the_options_of_all_sections_have_a_help(capsys):
         benchmark.parsed(["--only", *benchmark.SECTIONS, "--help"])
     assert ended.value.code == 0
     assert "--bar-kinds" in capsys.readouterr().out
+
+
+def test_one_command_writes_markdown_and_json(tmp_path, capsys):
+    threads = torch.get_num_threads()
+    try:
+        benchmark.main(["--out", str(tmp_path), "--only", "gpu", "--quick", "--gpu-sizes", "96", "--gpu-stacks", "1"])
+    finally:
+        torch.set_num_threads(threads)
+    summary = json.loads((tmp_path / "gpu.json").read_text())
+    assert summary["machine"]["torch"] == torch.__version__
+    assert {"OpenCV", "SciPy", "scikit-image", "Kornia"} < set(summary["machine"]["libraries"])
+    assert summary["options"]["gpu_stacks"] == [1]
+    rate, *cases = summary["rows"]
+    assert rate["bytes_a_second"] > 1e8
+    works = ["tracker, dewarp", "detection", "restoration, exact", "restoration, dewarp"]
+    assert [row["work"] for row in cases] == works
+    for row in cases:
+        assert row["seconds"] > 0
+        assert 0 < row["transfers"] < row["operations"]
+    text = (tmp_path / "benchmark.md").read_text()
+    assert text in capsys.readouterr().out + "\n"
+    assert sum(line.startswith("| cpu | 96² | 1 |") for line in text.splitlines()) == 4
