@@ -123,7 +123,7 @@ def _without_moving_parts(
     moving = _moving_parts(refined, timing, stacks)
     share = moving.mean((1, 2, 3))
     tried = where & halves_move_apart(refined.other_motion) & (share > 0) & (share < _MOST_MOVING)
-    for index in np.flatnonzero(tried):
+    for index in np.flatnonzero(tried).tolist():
         part = stacks.one(index).only(~moving[index : index + 1])
         other = attempt(part, timing, options, Hypothesis(found.scale, is_doubtful=True))
         better[index] = sum(map(bool, other.findings[0])) < sum(map(bool, found.findings[index]))
