@@ -384,6 +384,11 @@ class GreyFrames:
         """Some neighbouring columns of each stack."""
         return self._changed(lambda values: values[..., part])
 
+    def only(self, where: Array) -> "GreyFrames":
+        """The stacks with data only ``where`` (B, T, H, W) is true."""
+        chosen = torch.from_numpy(where).to(self.images.device)
+        return replace(self, valid=chosen if self.valid is None else self.valid & chosen)
+
     def one(self, index: int) -> "GreyFrames":
         """One stack out of the batch, as a batch of one."""
         return replace(self._changed(lambda values: values[index : index + 1]), batched=False)

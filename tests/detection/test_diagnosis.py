@@ -236,6 +236,21 @@ def test_parallax_does_not_refuse_halves_that_vibrate_alike():
     assert "halves_apart" in set.union(*codes(detect_vibration(beside([LARGE_MOTION, moving], 2), BLURRED_TIMING)))
 
 
+def test_parts_that_move_by_themselves_are_left_out_of_each_stack_of_a_batch():
+    """The parts travel by 4 px per frame over a sixth of the frame; rows that they cover moved by a mean of both."""
+    travelling = replace(LARGE_MOTION, image_motion=(120.0, -60.0))
+    clear, other = (
+        recorded(BLURRED_SIZE, BLURRED_TIMING, one, 4, 0.004, seed=n) for n, one in ((3, LARGE_MOTION), (4, travelling))
+    )
+    clouded = clear.clone()
+    clouded[:, 64:128, :80] = other[:, 64:128, :80]
+    found = detect_vibration(torch.stack([clouded, clear])[:, :, None], BLURRED_TIMING)
+    for of_stack in (found[0], found[1], detect_vibration(clouded, BLURRED_TIMING)):
+        assert codes(of_stack) == [set(), set()]
+        error = of_stack.vibration.amplitude[:, 0].numpy() - LARGE_MOTION.amplitude
+        assert (np.abs(error) < 4 * of_stack.std.amplitude[:, 0].numpy()).all()
+
+
 def test_a_subject_on_half_of_the_frame_is_not_the_camera():
     """It moves along x by 1.7 px at 8.9 Hz, which was reliable as the vibration of the camera."""
     subject = Motion((1.7, 0.0), (8.9, 0.0), (0.0, 0.0), (40.0, 10.0))

@@ -309,7 +309,7 @@ def column_pattern_of(groups: list[FrameGroups], timing: RowTiming, motion: Moti
     return column_pattern(parts)
 
 
-_SUMMED_ROWS = 64  # rows of a sum from which the displacements of parts of the rows are found
+SUMMED_ROWS = 64  # rows of a sum from which the displacements of parts of the rows are found
 
 
 def differential_motion(gradients: list[RowGradients], stacks: int, *, uniform: bool = True) -> Array:
@@ -357,7 +357,7 @@ def displacements_of_parts(gradients: RowGradients, parts: int = 4) -> tuple[Ten
 
     Also the variance of their noise, and (B, N) whether all parts have structure along both directions.
     """
-    sums, rows = gradients.quarters.unflatten(2, (parts, -1)).sum(3), _SUMMED_ROWS
+    sums, rows = gradients.quarters.unflatten(2, (parts, -1)).sum(3), SUMMED_ROWS
     count = sums.shape[1] // rows * rows
     weight = torch.where(gradients.variance > 0, 1 / gradients.variance.clamp(min=1e-300), 0.0)[:, :count, None, None]
     hxx, hxy, hyy, bx, by = (sums[:, :count] * weight).unflatten(1, (-1, rows)).sum(2).unbind(-1)
