@@ -116,7 +116,8 @@ def test_marked_options_of_process_stack_are_those_of_run_and_restore(place, tmp
         assert marked <= set(capsys.readouterr().out.split())
     assert rsvib(*command(place, "run", tmp_path / "out"), "--workers", 1) == 0
     manifest = read_manifest(tmp_path / "out" / "manifest.json")
-    assert manifest.settings.keys() == {"sensor", "given", *fields_of(StackOptions)} - {"memory", "workers"}
+    unstored = {"memory", "workers", "motion"}  # ``given`` stands for detections and for a motion
+    assert manifest.settings.keys() == {"sensor", *fields_of(StackOptions)} - unstored
 
 
 def test_a_session_that_is_stopped_before_it_begins_is_one_line(place, tmp_path, capsys, monkeypatch):
