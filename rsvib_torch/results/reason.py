@@ -208,8 +208,8 @@ _TONES = {
     "neighbours_unexplained": _px(
         "neighbouring rows move by {value:.3g} px that no tone explains, {limit:.2g} px are allowed",
         f"{_TONES_OR_FREE}, {_CHECK_TIMING}",
-        "the part of the residual that neighbouring rows have in common, above 0.01 px, 0.25 % of the rms offsets and "
-        "60 % of the rms residual, with 95 % confidence",
+        "the part of the residual that neighbouring rows have in common, above 0.01 px and 0.25 % of the rms offsets, "
+        "with 95 % confidence",
         free_model=True,
     ),
     "halves_apart": _px(

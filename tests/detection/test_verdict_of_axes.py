@@ -108,8 +108,6 @@ def rows_of(unexplained=0.0, correlated=0.0, differential=0.0, measured=1.0, blu
         ({"correlated": 0.1}, [["neighbours_unexplained"], []]),
         ({"correlated": 0.02}, [["neighbours_unexplained"], []]),
         ({"correlated": 0.02, "size": 9.0}, [[], []]),  # errors of interpolation increase with the displacement
-        ({"correlated": 0.02, "unexplained": 0.04}, [[], []]),  # most of the rest is not common: errors of an encoder
-        ({"correlated": 0.02, "unexplained": 0.03}, [["neighbours_unexplained"], []]),
         ({"differential": 0.1}, [[], ["halves_apart"]]),  # along x: a zoom, which displaces rows along y
         ({"differential": 0.3}, [["halves_apart"]] * 2),  # two motions along x
         ({"unexplained": 0.3, "differential": 0.1}, [["rows_unexplained"], ["halves_apart"]]),

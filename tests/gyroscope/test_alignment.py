@@ -53,7 +53,7 @@ def test_command_does_not_restore_with_a_motion_that_does_not_fit(tmp_path, caps
         assert not (tmp_path / "out.tif").exists()
     arguments = (*arguments, opposite, *focal, "--offset", CLOCK)
     assert rsvib(*arguments) == 0
-    assert "4 frames unchanged" in capsys.readouterr().out
+    assert "4 frames in 1 window, 0 restored" in capsys.readouterr().out
     assert (rsv.read_stack(tmp_path / "out.tif") == frames).all()
     assert rsvib(*arguments, "--force", "--overwrite") == 0
     assert not (rsv.read_stack(tmp_path / "out.tif") == frames).all()

@@ -48,8 +48,9 @@ class Positions:
         cls, scene_rows: Tensor, columns: Tensor, starts: Tensor, timing: RowTiming, motion: Motion
     ) -> "Positions":
         """Positions of given scene rows in frames that start at ``starts`` (B, G, 1)."""
-        rows, displacement = rows_showing(scene_rows, starts, timing, motion)
-        return cls(scene_rows, columns, rows, displacement[..., 0] - columns, starts + rows * timing.row_time)
+        rows, _ = rows_showing(scene_rows, starts, timing, motion)
+        along = motion.mean_displacement(starts + rows * timing.row_time, timing.exposure_time)[..., 0]
+        return cls(scene_rows, columns, rows, along - columns, starts + rows * timing.row_time)
 
     def visible(self, height: int, block: int) -> Tensor:
         """(B, G, S) float64, 1 for blocks of scene rows that lie inside a frame of ``height`` rows, else 0."""
