@@ -123,7 +123,8 @@ def test_windows_that_restoration_does_not_help_are_named_with_the_first_reason(
     worse = replace(window(1, TWO_TONES), outcome="worse", verdict="restored is no better than raw: noise")
     manifest = manifest_of(better, worse)
     (doubt,) = manifest.doubts
-    assert " ".join(doubt.split()) == "improvement not certain in 1 window; in window 1: restored is no better than raw: noise"
+    said = "improvement not certain in 1 window; in window 1: restored is no better than raw: noise"
+    assert " ".join(doubt.split()) == said
     assert doubt in manifest.lines()[1]
     assert "1 of 2 windows restored" in manifest.summary()
     assert manifest_of(better).doubts == []
