@@ -115,22 +115,29 @@ def _without_moving_parts(
     """Stacks without the parts of the frames that move by themselves, and their attempt, if it refuses fewer axes.
 
     Rows that clouds or objects cover in part have a displacement between both motions. It is tried for the stacks
-    ``where`` (B,) the halves of the rows move apart.
+    ``where`` (B,) is true and the halves of the rows move apart.
     """
-    refined, better = found.fitted.refined, np.zeros_like(where)
-    if refined is None or not (where & halves_move_apart(refined.other_motion)).any():
+    refined = found.fitted.refined
+    if refined is None:
         return stacks, found
+    where = where & halves_move_apart(refined.other_motion)
+    if not where.any():
+        return stacks, found
+    # 1. The stacks in which some parts, but not most of them, move by themselves, without these.
     moving = _moving_parts(refined, timing, stacks)
     share = moving.mean((1, 2, 3))
-    tried = where & halves_move_apart(refined.other_motion) & (share > 0) & (share < _MOST_MOVING)
-    for index in np.flatnonzero(tried).tolist():
-        part = stacks.one(index).only(~moving[index : index + 1])
-        other = attempt(part, timing, options, Hypothesis(found.scale, is_doubtful=True))
-        better[index] = sum(map(bool, other.findings[0])) < sum(map(bool, found.findings[index]))
-    if not better.any():
+    where = where & (share > 0) & (share < _MOST_MOVING)
+    if not where.any():
         return stacks, found
-    if len(better) > 1:
-        part = stacks.only(~(moving & better[:, None, None, None]))
+    part = stacks.some(where).only(~moving[where])
+    other = attempt(part, timing, options, Hypothesis(found.scale, is_doubtful=True))
+    # 2. All stacks, without these parts where that refuses fewer axes.
+    for index, against in zip(np.flatnonzero(where).tolist(), other.findings, strict=True):
+        where[index] = sum(map(bool, against)) < sum(map(bool, found.findings[index]))
+    if not where.any():
+        return stacks, found
+    if not where.all():
+        part = stacks.only(~(moving & where[:, None, None, None]))
         other = attempt(part, timing, options, Hypothesis(found.scale))
     return part, other
 

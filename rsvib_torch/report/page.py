@@ -177,7 +177,7 @@ def figures_of(report: Report, removed: Vibration | None) -> Iterator[tuple[str,
     """Name of the file, caption, and drawing of everything that the page shows."""
     if report.restored is not None:
         points = report.restored.shape[-1] // report.frames.shape[-1]
-        grid = f", which have {points} x {points} points per px" * (points > 1)
+        grid = f", which have {points} x {points} points per px" if points > 1 else ""
         caption = f"Parts of both frames with the strongest detail{grid}; each pair has a grey scale of its own."
         yield "before_after", caption, partial(frames_figure, report)
     if report.detection is not None:
