@@ -145,10 +145,10 @@ def scene_reasons(curve: OffsetCurve, columns: int) -> list[list[Reason]]:
     Without it, 6 of 24 stacks of 2 to 8 frames of independent noise had reliable axes, with amplitudes of 5 to 52 px;
     and a motion beyond the search range, of which a sixth of the bands was registered, had a wrong one.
     """
-    registered = curve.good.double().mean((1, 2)).tolist()
-    against, what = list[list[Reason]](), {"what": "the row bands"}
-    for similar, found in zip(similar_share(curve, columns).tolist(), registered, strict=True):
+    registered, against = curve.good.double().mean((1, 2)).tolist(), list[list[Reason]]()
+    for similar, found in zip(similar_share(curve, columns).amin(-1).tolist(), registered, strict=True):
         share, limit = (found, _MIN_REGISTERED) if found < _MIN_REGISTERED else (similar, _MIN_MEASURED)
+        what = {"what": "the row bands" if found < _MIN_REGISTERED else "the row bands of two frames"}
         against.append([Reason("rows_not_registered", None, share, limit, what)] if share < limit else [])
     return against
 

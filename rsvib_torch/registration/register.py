@@ -147,10 +147,9 @@ def register_bands(frames: FramesOrFiles, timing: SensorTiming, options: BandReg
 
 
 def similar_share(curve: OffsetCurve, columns: int) -> Tensor:
-    """(B,) share of the registered bands of frames of ``columns`` px that correlate more than noise or other scenes."""
+    """(B, P) share of the bands of frames of ``columns`` px that correlate more than noise, of those registered."""
     limit = max(0.1, _CHANCE / math.sqrt(max(curve.heights) * columns))
-    good = curve.good.flatten(1)
-    return ((curve.quality.flatten(1) > limit) & good).double().sum(1) / good.double().sum(1).clamp(min=1.0)
+    return ((curve.quality > limit) & curve.good).double().sum(-1) / curve.good.double().sum(-1).clamp(min=1.0)
 
 
 def fits_frame(num_rows: int, width: int, options: RegistrationOptions) -> bool:

@@ -297,8 +297,10 @@ _SHAPES = {
         compares="rms residual of the rows, above 15 % of their motion and 0.03 px",
     ),
     "bands_contradict": _px(
-        "the offsets of row bands differ by {value:.3g} px from it, {limit:.3g} px are allowed: noise hides the scene",
-        compares="mean difference of the best three quarters of the row bands, above 0.1 px and 30 % of the offsets",
+        "the offsets of row bands of two frames differ by {value:.3g} px from it, {limit:.3g} px are allowed: noise "
+        "hides the scene, or a frame shows another one",
+        compares="mean difference of the best three quarters of the row bands of two frames, above 0.1 px and 30 % of "
+        "the mean deviation of the offsets of two frames",
     ),
     "motion_uncertain": _px(
         "the motion is determined to {value:.3g} px only, {limit:g} px are needed: frames may show different scenes",

@@ -99,6 +99,26 @@ def test_missing_pixels_do_not_change_the_result(frames):
     assert torch.equal(holes.displacement, masked.displacement)
 
 
+def refuses_frames(frames):
+    """Whether the row bands refuse both axes, or nothing determines the motion."""
+    try:
+        findings = rsv.detect_motion(frames, TIMING).findings
+    except ValueError as error:
+        return "the frames do not determine the motion" in str(error)
+    codes = [{reason.code for reason in reasons} for reasons in findings]
+    return all(of_axis & {"rows_not_registered", "bands_contradict"} for of_axis in codes)
+
+
+@pytest.mark.parametrize("place", [0, 2, 4])
+@pytest.mark.parametrize("what", ["noise", "other scene"])
+def test_one_frame_without_the_scene_is_refused(frames, what, place):
+    """The rows of such a frame are measured around the spline, which they confirm: errors were 5 to 40 px."""
+    few, other = frames[:5].clone(), recorded((HEIGHT, WIDTH), TIMING, jitter, 1, 0.005, seed=7)[0]
+    few[place] = torch.rand_like(few[0]) if what == "noise" else other
+    assert rsv.detect_motion(frames[:5], TIMING).reliable.all()
+    assert refuses_frames(few)
+
+
 def test_motion_beyond_the_search_range_is_reported():
     far = Curve(lambda t: np.stack([30 * np.sin(2 * np.pi * t / TIMING.frame_period * 0.7), 0 * t], axis=-1))
     frames = recorded((HEIGHT, WIDTH), TIMING, far, 3, 0.005, seed=6)

@@ -311,8 +311,11 @@ def _bands_reasons(start: BandStart, columns: int, motion: Motion, axes: int) ->
     offsets, rest = (  # (N, 2) px, of the bands that were found
         np.diff(values[0], axis=1)[found, 0] for values in (banded.displacements, residual_of_motion(banded, motion))
     )
-    allowed = np.maximum(_MAX_BAND_ERROR, 0.3 * np.abs(offsets - offsets.mean(0)).mean(0))  # px
-    left = np.sort(np.abs(rest), 0)[: math.ceil(0.75 * len(rest))].mean(0)  # clouds may cover the other bands
+    # those of each pair of frames: one frame of noise, or of another scene, in a stack is not seen in the mean of all
+    of_pair = np.repeat(np.arange(len(start.curve.pairs)), len(start.curve.rows))[found]
+    pairs = [of_pair == pair for pair in np.unique(of_pair)]
+    spread = np.mean([np.abs(offsets[pair] - offsets[pair].mean(0)).mean(0) for pair in pairs], 0)
+    left, allowed = np.max([_typical(rest[pair]) for pair in pairs], 0), np.maximum(_MAX_BAND_ERROR, 0.3 * spread)  # px
     against = scene_reasons(start.curve, columns)[0]
     return [
         [*against, Reason("bands_contradict", name, float(left[axis]), float(allowed[axis]))]
@@ -320,6 +323,11 @@ def _bands_reasons(start: BandStart, columns: int, motion: Motion, axes: int) ->
         else list(against)
         for axis, name in enumerate(AXIS_NAMES[:axes])
     ]
+
+
+def _typical(offsets: Array) -> Array:
+    """Mean (2,) of the smaller three quarters of offsets (N, 2) of bands: clouds may cover the others."""
+    return np.sort(np.abs(offsets), 0)[: math.ceil(0.75 * len(offsets))].mean(0)
 
 
 def _motion(fit: SplineFit, largest_drift: tuple[float, float] = (0.0, 0.0)) -> FreeMotion:
