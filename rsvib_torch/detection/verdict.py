@@ -139,16 +139,19 @@ def _reasons_against_stack(stack: Table, timing: RowTiming, max_tones: float, in
     return [[*aliases, *reasons] for reasons in against]
 
 
-def scene_reasons(curve: OffsetCurve, columns: int) -> list[list[Reason]]:
+def scene_reasons(curve: OffsetCurve, columns: int, *, of_pairs: bool = False) -> list[list[Reason]]:
     """For each stack, the reason against frames that show different scenes or noise; ``columns`` is their width in px.
 
     Without it, 6 of 24 stacks of 2 to 8 frames of independent noise had reliable axes, with amplitudes of 5 to 52 px;
-    and a motion beyond the search range, of which a sixth of the bands was registered, had a wrong one.
+    and a motion beyond the search range, of which a sixth of the bands was registered, had a wrong one. ``of_pairs``
+    compares the pair of frames with the fewest similar bands instead of all together: a free motion, other than tones,
+    follows one frame of noise.
     """
-    registered, against = curve.good.double().mean((1, 2)).tolist(), list[list[Reason]]()
-    for similar, found in zip(similar_share(curve, columns).amin(-1).tolist(), registered, strict=True):
-        share, limit = (found, _MIN_REGISTERED) if found < _MIN_REGISTERED else (similar, _MIN_MEASURED)
-        what = {"what": "the row bands" if found < _MIN_REGISTERED else "the row bands of two frames"}
+    registered, similar = curve.good.double().mean((1, 2)), similar_share(curve, columns)
+    of_stacks = similar.amin(-1) if of_pairs else similar.mean(-1)
+    against, what = list[list[Reason]](), {"what": "the row bands of two frames" if of_pairs else "the row bands"}
+    for share_similar, found in zip(of_stacks.tolist(), registered.tolist(), strict=True):
+        share, limit = (found, _MIN_REGISTERED) if found < _MIN_REGISTERED else (share_similar, _MIN_MEASURED)
         against.append([Reason("rows_not_registered", None, share, limit, what)] if share < limit else [])
     return against
 

@@ -75,25 +75,33 @@ def rows_showing(
 
     They are the solution of ``r = s + Y(t(r))``.
     Row r is exposed from ``frame_start + r T_row`` on, and Y is the mean displacement over that exposure (Eq. 2).
-    Newton's method; ``|dY/dt| T_row`` is 0.02 for 5 px at 30 Hz, and must stay below 1: content that moves along the
-    scan as fast as the rows is never passed. The vibration is in row order, its batch dimensions lead; ``frame_start``
-    in s broadcasts to S, and other exposures in s than that of the sensor to (S, 1).
+    Newton's method with shorter steps where a step increases the error; ``|dY/dt| T_row`` is 0.02 for 5 px at 30 Hz,
+    and must stay below 1: content that moves along the scan as fast as the rows is never passed. The vibration is in
+    row order, its batch dimensions lead; ``frame_start`` in s broadcasts to S, and other exposures in s than that of
+    the sensor to (S, 1).
     """
     check_two_axes(vibration, "the displacement of a row")
     scene_rows = scene_rows.to(torch.float64)
     rows = scene_rows + torch.zeros_like(frame_start)
     near = torch.tensor([-1e-3, 0.0, 1e-3], dtype=torch.float64, device=rows.device)  # rows, for the derivative
     exposure = timing.exposure_time if exposure_time is None else exposure_time
-    for iteration in range(8):
+    least, last = torch.full_like(rows, torch.inf), torch.zeros_like(rows)  # |error| before the last step; that step
+    for _ in range(16):  # of 71 motions with |dY/dt| T_row of 0.5 to 0.9, all are right after 11; without halves 11 not
+        # 1. The error at the rows, and its derivative; the limit keeps steps finite near 0.
         starts = frame_start[..., None] + (rows[..., None] + near) * timing.row_time
         before, displacement, after = vibration.mean_displacement(starts, exposure).unbind(-2)
         slope = (after - before) / 2e-3
-        # the limit keeps steps finite near slope 1
-        step = (scene_rows + displacement[..., 1] - rows) / (1.0 - slope[..., 1].detach()).clamp(min=0.1)
+        error = scene_rows + displacement[..., 1] - rows
+        newton = error / (1.0 - slope[..., 1].detach()).clamp(min=0.1)
+        # 2. Newton's step; half of the last step back, where that step has increased the error.
+        worse = error.detach().abs() > least
+        step = torch.where(worse, -0.5 * last, newton)
         rows, displacement = rows + step, displacement + slope * step[..., None]
-        # a step of 1e-3 px would be followed by less than its square, far below any measurement
-        if iteration > 0 and bool((step.abs() < 1e-3).all()):
+        # 3. Each step is the square of the last one times the same number: end if the next one would be below 1e-6 px.
+        if bool((step.detach().abs() ** 3 <= 1e-6 * (last**2 + 1e-12)).all()):
             break
+        least = torch.where(worse, least, error.detach().abs())
+        last = torch.where(worse, 0.5 * last, newton.detach())
     return rows, displacement
 
 

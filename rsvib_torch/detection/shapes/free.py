@@ -316,7 +316,7 @@ def _bands_reasons(start: BandStart, columns: int, motion: Motion, axes: int) ->
     pairs = [of_pair == pair for pair in np.unique(of_pair)]
     spread = np.mean([np.abs(offsets[pair] - offsets[pair].mean(0)).mean(0) for pair in pairs], 0)
     left, allowed = np.max([_typical(rest[pair]) for pair in pairs], 0), np.maximum(_MAX_BAND_ERROR, 0.3 * spread)  # px
-    against = scene_reasons(start.curve, columns)[0]
+    against = scene_reasons(start.curve, columns, of_pairs=True)[0]
     return [
         [*against, Reason("bands_contradict", name, float(left[axis]), float(allowed[axis]))]
         if axis < 2 and left[axis] > allowed[axis]
