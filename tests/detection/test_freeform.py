@@ -1,5 +1,7 @@
 """Motion of any shape from frames of an independent simulator: observable and unobservable parts."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -117,6 +119,16 @@ def test_one_frame_without_the_scene_is_refused(frames, what, place):
     few[place] = torch.rand_like(few[0]) if what == "noise" else other
     assert rsv.detect_motion(frames[:5], TIMING).reliable.all()
     assert refuses_frames(few)
+
+
+@pytest.mark.parametrize(("stated", "refused"), [(40.0, False), (80.0, True)])
+def test_an_exposure_that_the_blur_contradicts_is_refused(stated, refused):
+    """Rows that are means over half of the stated time show too small a motion."""
+    swing = Curve(lambda t: np.stack([2.0 * np.sin(300 * t), 1.5 * np.sin(222 * t + 1.0)], -1))
+    frames = recorded((HEIGHT, WIDTH), replace(TIMING, exposure_rows=40), swing, 4, 0.005, seed=6)
+    found = rsv.detect_motion(frames, replace(TIMING, exposure_rows=stated))
+    codes = [[reason.code for reason in reasons] for reasons in found.findings]
+    assert ["blur_contradicts_exposure" in of_axis for of_axis in codes] == [refused] * 2
 
 
 def test_motion_beyond_the_search_range_is_reported():

@@ -143,7 +143,7 @@ class GroupedFrames:
         """Whether a motion changes little within the width of what is measured."""
         return True
 
-    def blur_ratio(self, motion: Vibration) -> Tensor:
+    def blur_ratio(self, motion: Vibration | FreeMotion) -> Tensor:
         """(B, 3) ratio, standard deviation and size as in ``displacements.blur_ratio``."""
         return blur_ratio(self.groups, self.timing, self.view(motion))
 
@@ -242,7 +242,7 @@ class GroupedStrips(GroupedFrames):
         # a second fit takes as long as the first; strips that are slightly too wide caused no bias that was measured
         return pitch <= 1.5 * _pitch(slope)
 
-    def blur_ratio(self, motion: Vibration) -> Tensor:
+    def blur_ratio(self, motion: Vibration | FreeMotion) -> Tensor:
         """(B, 3), the weighted mean over every second strip: they contain all columns.
 
         A displacement that changes within a strip acts like blur: with a focal length of 400 px and 5 px, where the
