@@ -170,6 +170,8 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         """Record images (H, W), (C, H, W) or (B, C, H, W); the other arguments are those of Kornia's augmentations."""
         if not torch.compiler.is_compiling():
             check_tensor("input", input)
+            if params is not None and not (isinstance(params, dict) and params.keys() >= set(_DRAWN)):
+                raise TypeError(f"params must be the parameters of another call, a dictionary, got {quoted(params)}")
         return super().forward(input, params, **kwargs)
 
     @checks_arguments

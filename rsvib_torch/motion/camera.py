@@ -208,6 +208,7 @@ class Camera:
         if components.ndim == 0 or not 2 <= components.shape[-1] <= 4:
             raise ValueError(f"components must have the shape (..., A) with A = 2 to 4, got {tuple(components.shape)}")
         check_broadcast(components=components[..., 0], x=x, y=y)
+        components = components if components.is_floating_point() else components.double()
         u, v = self.rays(x.to(components), y.to(components))
         pitch, yaw, roll = self.attitude(components).unbind(-1)
         # Rodrigues: R(-w) r = cos a r - sinc(a) w x r + (1 - cos a) / a^2 w (w . r), a = |w|

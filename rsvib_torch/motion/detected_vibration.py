@@ -81,6 +81,7 @@ class DetectedVibration(
 
     def physical_summary(self, pixel_size: float) -> str:
         """Amplitudes of displacement, velocity and acceleration of the tones of x and y, for a pixel size in m."""
+        check_pixel_size(pixel_size)
         rows = []
         for at, labels in tone_places(self.vibration):
             amplitude, frequency = float(self.vibration.amplitude[at]), float(self.vibration.frequency[at])

@@ -202,15 +202,13 @@ class Vibration(
         return torch.cat([self.amplitude, self.frequency, self.phase, polynomial], -1)
 
     @classmethod
-    def stacked(cls, results: Sequence[Self]) -> Self:
-        """Vibrations with the same axes and camera as a batch; missing tones have amplitude 0."""
+    def _of_equal_shapes(cls, results: Sequence[Self]) -> Sequence[Self]:
+        """Vibrations with as many tones as the one with most; missing tones have amplitude 0."""
         missing = [max(other.amplitude.shape[-1] for other in results) - one.amplitude.shape[-1] for one in results]
-        return super().stacked(
-            [
-                one._changed(**{name: functional.pad(getattr(one, name), (0, tones)) for name in _QUANTITIES})
-                for one, tones in zip(results, missing, strict=True)
-            ]
-        )
+        return [
+            one._changed(**{name: functional.pad(getattr(one, name), (0, tones)) for name in _QUANTITIES})
+            for one, tones in zip(results, missing, strict=True)
+        ]
 
     def scaled(self, factor: Tensor | float) -> "Vibration":
         """The vibration with its components multiplied by factors (..., A), or one factor, that are not negative."""

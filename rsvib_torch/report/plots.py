@@ -60,7 +60,7 @@ class _Drawing(Figure):
 
 @checks_arguments
 def save_figure(
-    figure: Figure, path: str | os.PathLike[str], *, dpi: Annotated[int, Field(ge=1, le=10_000)] = 150
+    figure: Figure, path: str | os.PathLike[str], *, dpi: Annotated[int, Field(ge=10, le=10_000)] = 150
 ) -> None:
     """Write a figure as an image file, atomically.
 

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import embedding_bag
 
-from rsvib_torch.checks.arguments import checks_arguments
-from rsvib_torch.checks.values import check_single, check_whole_number, described
+from rsvib_torch.checks.arguments import check_tensor, checks_arguments
+from rsvib_torch.checks.values import check_single, check_whole_number
 from rsvib_torch.execution.parallel import at_once, runs
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.prepare import frames_from_row_order, frames_to_row_order
@@ -158,8 +158,8 @@ class FixedDewarp(nn.Module):
 
     def forward(self, frames: Tensor) -> Tensor:
         """Restore frames (T, H, W), (T, C, H, W) or (B, T, C, H, W)."""
-        if not isinstance(frames, Tensor):
-            raise TypeError(f"frames must be a tensor, got {described(frames)}")
+        if not torch.compiler.is_compiling():
+            check_tensor("frames", frames)
         if frames.dtype != self.to_spectra.dtype:
             raise TypeError(
                 f"frames must be {self.to_spectra.dtype} as the module, got {frames.dtype}; pass frames.float()"

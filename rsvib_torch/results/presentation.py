@@ -288,8 +288,14 @@ class Result(Summarised):
                 return torch.stack(values)  # type: ignore[arg-type]
             return type(first).stacked(values) if isinstance(first, Result) else tuple(values)
 
-        first: Self = results[0]
-        return first._changed(**{n: joined([getattr(one, n) for one in results]) for n in first._fields_of_batch()})
+        members = cls._of_equal_shapes(results)
+        names = members[0]._fields_of_batch()
+        return members[0]._changed(**{name: joined([getattr(one, name) for one in members]) for name in names})
+
+    @classmethod
+    def _of_equal_shapes(cls, results: Sequence[Self]) -> Sequence[Self]:
+        """The results with tensors of equal shapes, if their type can be extended."""
+        return results
 
     def to_dict(self) -> Table:
         """All values as nested lists, numbers and texts, which JSON can store; None for numbers that are not finite."""
