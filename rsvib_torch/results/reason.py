@@ -241,10 +241,11 @@ _TONES = {
         free_model=True,
     ),
     "motion_within_row_time": _px(
-        "the image moves {value:.2g} px within a row time, condition (24) allows {limit:g} px: the camera does not "
-        "move as a whole, or row_time is wrong",
+        "the image moves {value:.2g} px within a row time, {limit:g} px are allowed: the camera does not move as a "
+        "whole, the frames show no detail along this axis, or row_time is wrong",
         "check row_time",
-        "method='bands': motion within a row time, above 0.1 px, condition (24) of the paper",
+        "motion within a row time, above 0.1 px with method='bands' (condition (24) of the paper), and above 0.5 px "
+        "along the scan otherwise",
     ),
     "other_frame_rows": _of_all_axes(
         "the frames agree with frame_rows={limit:.5g}, not with {value:g}: frame_rows counts the blanking rows and is "
