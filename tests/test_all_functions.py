@@ -207,7 +207,7 @@ def test_restoration_with_a_detected_motion_is_differentiable():
     assert float(found.amplitude.grad.abs().max()) > 0
 
 
-@pytest.mark.parametrize("buffers", [1, 4])
+@pytest.mark.parametrize("buffers", [1, pytest.param(4, marks=pytest.mark.slow)])
 def test_buffers_that_are_written_to_again_change_no_tracked_frame(buffers):
     memory = torch.zeros(buffers, *FRAMES.shape[1:])
     trackers = [rsv.VibrationTracker(TIMING, window=4) for _ in range(2)]

@@ -48,6 +48,7 @@ def test_satellite(pages, tmp_path):
     assert rsv.psnr(names["restored"][0], names["still"], 1.0, rim=24) > 40
 
 
+@pytest.mark.slow
 def test_video(pages, tmp_path):
     names = run(pages, "video.md", tmp_path)
     assert not rsv.read_vibration(tmp_path / "blind" / "vibration.json", names["timing"]).reliable[1]
@@ -61,6 +62,7 @@ def test_video(pages, tmp_path):
     assert re.search(r"^row_time = 0\.0001000\d*$", (tmp_path / "led.toml").read_text(), flags=re.MULTILINE)
 
 
+@pytest.mark.slow
 def test_training(pages, tmp_path):
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # with two, the training of the small networks ends elsewhere

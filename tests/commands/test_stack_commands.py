@@ -149,6 +149,7 @@ def test_errors_are_one_line_and_leave_no_files(place, tmp_path, capsys, options
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_raw_frames_behind_colour_filters_on_a_finer_grid(tmp_path):
     """In windows, with the page of the first one."""
     raw, out, config = tmp_path / "raw.tif", tmp_path / "out", tmp_path / "mosaic.toml"

@@ -192,6 +192,7 @@ def test_visible_pixels_follow_the_roll():
     assert np.mean(mask.numpy() != expected) < 0.15 * np.mean(~expected)
 
 
+@pytest.mark.slow
 def test_focal_length_gives_the_vibration_of_a_camera_with_a_wide_field():
     lens = (-0.12, 0.05, 1e-3, -2e-3, 0.01)
     truth = LensMotion((3.0, 4.0, 0.0, 0.0), (38.0, 31.0, 0.0, 0.0), (0.3, 1.1, 0.0, 0.0), 300.0, (6.0, -4.0), lens)

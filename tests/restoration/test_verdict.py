@@ -320,7 +320,9 @@ def test_pairs_to_judge():
 
 
 @pytest.mark.parametrize(
-    ("options", "direction"), [({"scale": 2}, "forward"), ({"mosaic": "GRBG", "scale": 2}, "reverse")], ids=str
+    ("options", "direction"),
+    [({"scale": 2}, "forward"), pytest.param({"mosaic": "GRBG", "scale": 2}, "reverse", marks=pytest.mark.slow)],
+    ids=str,
 )
 def test_finer_grids_and_mosaics_are_judged_at_the_pixels(options, direction):
     timing = SensorTiming(row_time=4e-5, exposure_rows=20, frame_rows=200, readout_direction=direction)

@@ -55,6 +55,7 @@ def shaking(path):
     return np.sqrt(np.square(shifts(strips)[2:-2]).sum(-1).mean())
 
 
+@pytest.mark.slow
 def test_the_scene_behind_a_large_subject_becomes_steady(place, tmp_path):
     report = process_video(
         place / "clip.mp4", tmp_path / "steady.mp4", TIMING, gyroscope=place / "rates.csv", **OPTIONS
@@ -69,6 +70,7 @@ def test_the_scene_behind_a_large_subject_becomes_steady(place, tmp_path):
     assert sound_of(tmp_path / "steady.mp4") == sound_of(place / "clip.mp4")
 
 
+@pytest.mark.slow
 def test_a_fisheye_lens(place, tmp_path, capsys):
     lens = {"camera_matrix": [[2 * FOCAL_LENGTH, 0, 215.5], [0, 2 * FOCAL_LENGTH, 199.5], [0, 0, 1]]}
     lens["distortion_coeffs"] = [-0.6, 0.2, 0.0, 0.0]  # moves the corners by 9 px
