@@ -82,6 +82,7 @@ def test_figures_are_drawn_and_on_a_page(tmp_path):
     assert all(f"]({name}." in pages for name in figures.PICTURES)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("mkdocstrings") is None, reason="MkDocs is not installed (extra docs)")
 def test_site_builds_without_a_warning(docs, tmp_path):
     site = tmp_path / "site"

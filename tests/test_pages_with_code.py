@@ -88,6 +88,7 @@ def test_recipes_of_the_architecture_page(tmp_path, monkeypatch):
             call()
 
 
+@pytest.mark.slow
 def test_page_on_roll_and_zoom():
     page = run_page("roll_and_zoom.md", 1)
     detection, truth = page["detection"], page["truth"]
