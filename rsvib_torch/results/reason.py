@@ -244,7 +244,7 @@ _TONES = {
         "the image moves {value:.2g} px within a row time, {limit:g} px are allowed: the camera does not move as a "
         "whole, the frames show no detail along this axis, or row_time is wrong",
         "check row_time",
-        "motion within a row time, above 0.1 px with method='bands' (condition (24) of the paper), and above 0.5 px "
+        "motion within a row time, above 0.1 px with method='bands' (condition (24) of the paper), and above 0.8 px "
         "along the scan otherwise",
     ),
     "other_frame_rows": _of_all_axes(
