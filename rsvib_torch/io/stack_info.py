@@ -133,14 +133,12 @@ class StackInfo:
 
     def with_shape(self, shape: tuple[int, ...]) -> "StackInfo":
         """A stack of another shape: times and files belong to its number of frames, a georeference to their size."""
-        changed = replace(self, shape=shape)
-        if changed.shape[-2:] != self.shape[-2:]:
-            kept = {name: None if tag is None or tag.scope == "image" else tag for name, tag in self.metadata.items()}
-            changed = replace(changed, metadata=kept)
-        if changed.shape[0] == self.shape[0]:
-            return changed
-        of_frames: Table = dict.fromkeys(("frame_times", "frame_numbers", "path", "files"))
-        return replace(changed, **of_frames)
+        metadata = self.metadata
+        if shape[-2:] != self.shape[-2:]:
+            metadata = {name: None if tag is None or tag.scope == "image" else tag for name, tag in metadata.items()}
+        same = tuple(shape[:1]) == self.shape[:1]
+        of_frames: Table = {} if same else dict.fromkeys(("frame_times", "frame_numbers", "path", "files"))
+        return replace(self, shape=shape, metadata=metadata, **of_frames)
 
     def with_frames(self, count: int) -> "StackInfo":
         """The same kind of stack with ``count`` frames."""

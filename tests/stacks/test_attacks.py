@@ -14,7 +14,7 @@ from attacks.trial import FAILURES
 # attack: trials in a test, and least share of them that completes the run; the others are refused
 ATTACKS = {
     "concurrent": (3, 0.5),
-    "damaged_parts": (12, 0.5),
+    "damaged_parts": (17, 0.5),
     "inputs": (12, 0.0),
     "interruptions": (14, 1.0),
     "live_sessions": (1, 0.0),

@@ -315,7 +315,7 @@ def _bands_reasons(start: BandStart, columns: int, motion: Motion, axes: int) ->
     offsets, rest = (  # (N, 2) px, of the bands that were found
         np.diff(values[0], axis=1)[found, 0] for values in (banded.displacements, residual_of_motion(banded, motion))
     )
-    # those of each pair of frames: one frame of noise, or of another scene, in a stack is not seen in the mean of all
+    # the pairs of frames one by one: one frame of noise, or of another scene, hardly changes the mean of all bands
     of_pair = np.repeat(np.arange(len(start.curve.pairs)), len(start.curve.rows))[found]
     pairs = [of_pair == pair for pair in np.unique(of_pair)]
     spread = np.mean([np.abs(offsets[pair] - offsets[pair].mean(0)).mean(0) for pair in pairs], 0)
@@ -327,9 +327,11 @@ def _bands_reasons(start: BandStart, columns: int, motion: Motion, axes: int) ->
         for axis, name in enumerate(AXIS_NAMES[:2])
         if excess[axis] > 1.0
     }
-    if excess.max() > _MISMATCH:
-        return [[*against, *contradicted.values()] for _ in range(axes)]
-    return [[*against, *(contradicted[name] for name in contradicted if name == axis)] for axis in AXIS_NAMES[:axes]]
+    of_all = excess.max() > _MISMATCH
+    return [
+        [*against, *(reason for name, reason in contradicted.items() if of_all or name == axis)]
+        for axis in AXIS_NAMES[:axes]
+    ]
 
 
 def _typical(offsets: Array) -> Array:
