@@ -204,7 +204,7 @@ def is_mosaic(images: Tensor, *, blocks: int | None = None, least: float = 3.0) 
     along_x, along_y = parts.diff(n=2, dim=-1), parts.diff(n=2, dim=-2)
     sign = 1 - 2 * (torch.arange(size, device=images.device) % 2)
     of_columns, of_rows, of_both = (
-        (high, (high * pattern).mean((-2, -1)))
+        (high.square().mean((-4, -3, -2, -1)), (high * pattern).mean((-2, -1)))
         for high, pattern in (
             (along_x[..., 1:-1, :], sign),
             (along_y[..., 1:-1], sign[:, None]),
@@ -214,8 +214,7 @@ def is_mosaic(images: Tensor, *, blocks: int | None = None, least: float = 3.0) 
 
     def exceed(one: tuple[Tensor, Tensor], other: tuple[Tensor, Tensor], white: float) -> Tensor:
         """Whether means of blocks agree; ``white`` is their mean square in white noise, relative to its differences."""
-        energy = (one[0].square().mean((-4, -3, -2, -1)) * other[0].square().mean((-4, -3, -2, -1))).sqrt()
-        return (one[1] * other[1]).mean((-2, -1)).abs() > least * white * energy
+        return (one[1] * other[1]).mean((-2, -1)).abs() > least * white * (one[0] * other[0]).sqrt()
 
     return exceed(of_both, of_both, (8 / 3 / size) ** 2) | exceed(of_columns, of_rows, 8 / 3 / size**2)
 

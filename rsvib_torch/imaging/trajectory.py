@@ -68,6 +68,10 @@ def exposure_trajectory(
     return vibration.path(starts, nodes * timing.exposure_time), weights
 
 
+# at most: of 71 motions with |dY/dt| T_row of 0.5 to 0.9, all are right after 11 rounds; without halves of steps 11 not
+_SEARCH_ROUNDS = 16
+
+
 def rows_showing(
     scene_rows: Tensor, frame_start: Tensor, timing: RowTiming, vibration: Motion, exposure_time: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
@@ -84,25 +88,30 @@ def rows_showing(
     scene_rows = scene_rows.to(torch.float64)
     rows = scene_rows + torch.zeros_like(frame_start)
     near = torch.tensor([-1e-3, 0.0, 1e-3], dtype=torch.float64, device=rows.device)  # rows, for the derivative
+    first = frame_start[..., None] + near * timing.row_time
     exposure = timing.exposure_time if exposure_time is None else exposure_time
-    least, last = torch.full_like(rows, torch.inf), torch.zeros_like(rows)  # |error| before the last step; that step
-    for _ in range(16):  # of 71 motions with |dY/dt| T_row of 0.5 to 0.9, all are right after 11; without halves 11 not
+    least = last = rows  # |error| before the last step, and that step, if there was one
+    largest = 0.0  # px, largest step of Newton's method
+    for number in range(_SEARCH_ROUNDS):
         # 1. The error at the rows, and its derivative; the limit keeps steps finite near 0.
-        starts = frame_start[..., None] + (rows[..., None] + near) * timing.row_time
-        before, displacement, after = vibration.mean_displacement(starts, exposure).unbind(-2)
-        slope = (after - before) / 2e-3
+        of_rows = vibration.mean_displacement(torch.add(first, rows[..., None], alpha=timing.row_time), exposure)
+        below, displacement, above = of_rows.unbind(-2)
+        slope = (above - below) / 2e-3
         error = scene_rows + displacement[..., 1] - rows
         newton = error / (1.0 - slope[..., 1].detach()).clamp(min=0.1)
-        # 2. Newton's step; half of the last step back, where that step has increased the error.
-        worse = error.detach().abs() > least
-        step = torch.where(worse, -0.5 * last, newton)
-        rows, displacement = rows + step, displacement + slope * step[..., None]
-        # 3. Each step is the square of the last one times the same number: end if the next one would be below 1e-6 px.
-        if bool((step.detach().abs() ** 3 <= 1e-6 * (last**2 + 1e-12)).all()):
+        # 2. Each step is the square of the last one times the same number: end if the next one would be below 1e-6 px.
+        size, change = error.detach().abs(), newton.detach()
+        before, largest = largest, float(change.abs().max())
+        if largest**3 <= 1e-6 * (before**2 + 1e-12) or number == _SEARCH_ROUNDS - 1:
             break
-        least = torch.where(worse, least, error.detach().abs())
-        last = torch.where(worse, 0.5 * last, newton.detach())
-    return rows, displacement
+        # 3. Newton's step; half of the last step back, where that step has increased the error.
+        step = newton
+        if number > 0:
+            worse, half = size > least, 0.5 * last
+            size, step = torch.where(worse, least, size), torch.where(worse, -half, newton)
+            change = torch.where(worse, half, change)
+        rows, least, last = rows + step, size, change
+    return rows + newton, displacement + slope * newton[..., None]
 
 
 # Columns at which displacements that differ along a row are computed; a polynomial interpolates them. Without a camera,

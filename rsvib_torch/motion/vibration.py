@@ -273,8 +273,9 @@ class Vibration(
         angle, amplitude, frequency = self._angle(middle)
         attenuation = torch.sinc(frequency * (exposure[..., None] if isinstance(exposure, Tensor) else exposure))
         tones = (amplitude * attenuation * angle.sin()).sum(-1)
-        curvature = self._at(middle, self.image_acceleration) * (exposure**2 / 24)
-        return tones + self.drift(middle) + curvature + self._at(middle, self.image_shift)
+        motion, acceleration, shift = (self._at(middle, getattr(self, name)) for name in _POLYNOMIAL)
+        motion = torch.addcmul(motion, acceleration, middle[..., None], value=0.5)
+        return torch.addcmul(tones + shift, motion, middle[..., None]) + acceleration * (exposure**2 / 24)
 
     def gain(self, interval: float) -> Tensor:
         """Gain 2 sin(pi f m T_row) from displacement to offset over ``interval`` seconds (Eq. 7), (..., 2, K).

@@ -68,7 +68,8 @@ def _found_rows(motion: FrameMotion, dtype: torch.dtype) -> tuple[Tensor, Tensor
     rows, moved = motion.frame_rows(torch.arange(motion.num_rows, dtype=torch.float64, device=motion.shift.device))
     cell = rows.detach().floor()
     weights = bspline_weights(rows - cell, _DEWARP_DEGREE).to(dtype)
-    offsets = torch.arange(_DEWARP_DEGREE + 1, device=rows.device) - _DEWARP_DEGREE // 2
+    first = -(_DEWARP_DEGREE // 2)
+    offsets = torch.arange(first, first + _DEWARP_DEGREE + 1, device=rows.device)
     taps = mirrored(cell.to(torch.int64)[..., None] + offsets, motion.num_rows)
     return taps.flatten(0, 1), weights.flatten(0, 1), moved[..., 0].flatten(0, 1)
 

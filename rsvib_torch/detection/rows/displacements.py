@@ -19,7 +19,14 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.detection.measurements import Measurements, trimmed_mean
-from rsvib_torch.detection.rows.warping import Positions, differently_blurred, exposure_paths, moments, warp_to_scene
+from rsvib_torch.detection.rows.warping import (
+    Positions,
+    differently_blurred,
+    exposure_paths,
+    moments,
+    reach_of_blur,
+    warp_to_scene,
+)
 from rsvib_torch.execution.parallel import chunks, runs
 from rsvib_torch.motion.motion import ColumnStrips, Motion
 from rsvib_torch.motion.timing import RowTiming
@@ -138,7 +145,8 @@ def measure_group(
     those of a motion that differs by much less than a pixel are given; they are returned for the next call.
     """
     spectra, motion = group.spectra.in_groups(group.count), group.motion_of_groups(motion)
-    positions = Positions.of(group.starts_of_groups, spectra.height, timing, motion)
+    margin = reach_of_blur(spectra.height, timing, motion)
+    positions = Positions.of(group.starts_of_groups, spectra.height, timing, motion, margin=margin)
     visible = positions.visible(spectra.height, BLOCK_ROWS)
     warp = warp_to_scene(spectra, positions, timing, motion)
     runs_of_rows = spectra.runs(positions.rows.shape[-1], 2)
@@ -168,7 +176,8 @@ def measure_strips(
     unit components at positions x and y in px from the centre.
     """
     spectra, count = group.spectra, len(strips.firsts)
-    positions = Positions.of(group.starts, spectra.height, timing, of_strips)
+    margin = reach_of_blur(spectra.height, timing, of_strips)
+    positions = Positions.of(group.starts, spectra.height, timing, of_strips, margin=margin)
 
     def over_strips(values: Tensor) -> Tensor:
         return values.unflatten(0, (-1, count))

@@ -33,24 +33,24 @@ class Positions:
     rows: Tensor  # (B, G, S) frame rows that contain the scene rows
     shift: Tensor  # (B, G, S) px, displacement along the rows to be taken out
     exposure_starts: Tensor  # (B, G, S) s, exposure starts of the frame rows
+    beyond: Tensor  # (2, B, G, S + 2 M) rows and shift, also of M scene rows before the first and behind the last one
 
     @classmethod
-    def of(cls, starts: Tensor, height: int, timing: RowTiming, motion: Motion, step: int = 1) -> "Positions":
-        """Positions of every ``step``-th scene row that the middle of a group of frames contains."""
-        rows = torch.arange(0, height, step, dtype=torch.float64, device=starts.device)
+    def of(
+        cls, starts: Tensor, height: int, timing: RowTiming, motion: Motion, step: int = 1, margin: int = 0
+    ) -> "Positions":
+        """Positions of every ``step``-th scene row that the middle of a group of frames contains, M is the margin."""
+        rows = torch.arange(-step * margin, height + step * margin, step, dtype=torch.float64, device=starts.device)
         # an image motion carries the group away from the first frame: rows and columns follow it by whole pixels
         middle = starts.mean(-1, keepdim=True) + 0.5 * height * timing.row_time
         travelled = motion.drift(middle).round()[:, :, None]  # (B, 1, 1, 2)
-        return cls.of_rows(rows - travelled[..., 1], travelled[..., 0], starts[..., None], timing, motion)
-
-    @classmethod
-    def of_rows(
-        cls, scene_rows: Tensor, columns: Tensor, starts: Tensor, timing: RowTiming, motion: Motion
-    ) -> "Positions":
-        """Positions of given scene rows in frames that start at ``starts`` (B, G, 1)."""
-        rows, _ = rows_showing(scene_rows, starts, timing, motion)
-        along = motion.mean_displacement(starts + rows * timing.row_time, timing.exposure_time)[..., 0]
-        return cls(scene_rows, columns, rows, along - columns, starts + rows * timing.row_time)
+        scene_rows, columns = rows - travelled[..., 1], travelled[..., 0]
+        of_rows, displacement = rows_showing(scene_rows, starts[..., None], timing, motion)
+        beyond = torch.stack([of_rows, displacement[..., 0] - columns])
+        inner = slice(margin, len(rows) - margin)
+        rows, shift = beyond[..., inner].unbind()
+        begin = torch.add(starts[..., None], rows, alpha=timing.row_time)
+        return cls(scene_rows[..., inner], columns, rows, shift, begin, beyond)
 
     def visible(self, height: int, block: int) -> Tensor:
         """(B, G, S) float64, 1 for blocks of scene rows that lie inside a frame of ``height`` rows, else 0."""
@@ -109,28 +109,29 @@ def _differences(paths: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
 # Warp
 
 
-def _between_rows(positions: Positions, timing: RowTiming, motion: Motion, away: Tensor) -> tuple[Tensor, Tensor]:
+def reach_of_blur(height: int, timing: RowTiming, motion: Motion) -> int:
+    """Margin of ``Positions`` beyond which no path of an exposure reaches."""
+    # the path of a fit that diverges may have any length
+    return 2 + math.ceil(min(height, float(motion.displacement_within(timing.exposure_time)[..., 1].max())))
+
+
+def _between_rows(positions: Positions, away: Tensor) -> tuple[Tensor, Tensor]:
     """Frame rows and shifts (B, G, S, N) of scene rows that are ``away`` (B, G, S, N) px from every scene row.
 
     Cubic interpolation between whole scene rows has an error of 1e-5 px for 3 px and periods of 60 rows. To solve for
     them takes a tenth to a third of the time of a detection behind long exposures.
     """
-    height = positions.scene_rows.shape[-1]
-    away = away.clamp(-height, height)  # the path of a fit that diverges may have any length
-    margin = math.ceil(float(away.abs().amax())) + 2
-    steps_of_rows = torch.arange(height + 2 * margin, dtype=away.dtype, device=away.device)
-    first = positions.scene_rows[..., :1] - margin
-    starts = (positions.exposure_starts - positions.rows * timing.row_time)[..., :1]
-    positions_of_rows = Positions.of_rows(first + steps_of_rows, positions.columns, starts, timing, motion)
-    place = away + (positions.scene_rows - first)[..., None]
+    count = positions.rows.shape[-1]
+    margin = (positions.beyond.shape[-1] - count) // 2
+    here = torch.arange(margin, margin + count, dtype=away.dtype, device=away.device)
+    place = away.clamp(2 - margin, margin - 2) + here[:, None]
     cell = place.floor()
     # the cubic polynomials (columns) by powers (rows) that are 1 at one of the places -1, 0, 1, 2 and 0 at the others
     cubic = place.new_tensor([[0, 6, 0, 0], [-2, -3, 6, -1], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6
     powers = torch.arange(4, device=away.device)
     weights = (place - cell)[..., None] ** powers @ cubic  # (B, G, S, N, 4)
     index = (cell.long()[..., None] + (powers - 1)).flatten(2)
-    values = torch.stack([positions_of_rows.rows, positions_of_rows.shift])  # (2, B, G, R)
-    near = values.gather(3, index.expand(2, -1, -1, -1)).view(2, *weights.shape)
+    near = positions.beyond.gather(3, index.expand(2, -1, -1, -1)).view(2, *weights.shape)
     rows, shift = (near * weights).sum(-1).unbind(0)
     return rows, shift
 
@@ -146,7 +147,7 @@ def warp_to_scene(
     paths = paths * different[:, None, None, None, None]
     if positions.rows.shape[1] > 2 or not bool(very_different.any()):
         return _warp_with_mean_moments(spectra, positions, paths, weights)
-    return _warp_along_paths(spectra, positions, timing, motion, paths, weights)
+    return _warp_along_paths(spectra, positions, paths, weights)
 
 
 def _warp_with_mean_moments(
@@ -187,7 +188,7 @@ def _warp_with_mean_moments(
 
 
 def _warp_along_paths(
-    spectra: RowSpectra, positions: Positions, timing: RowTiming, motion: Motion, paths: Tensor, weights: Tensor
+    spectra: RowSpectra, positions: Positions, paths: Tensor, weights: Tensor
 ) -> Callable[[slice], Tensor]:
     """``warp_to_scene`` of pairs: each frame is blurred once more, along the path of the other.
 
@@ -199,7 +200,7 @@ def _warp_along_paths(
     by_x = (2j * math.pi * spectra.frequencies).to(spectra.values.dtype)
     slope = torch.gradient(moments(paths, weights, 2), dim=2)[0][..., None, None].to(by_x.real) / 2
     x, y = paths.flip(1).unbind(-1)  # of the other frame
-    node_rows, node_shift = _between_rows(positions, timing, motion, -y)
+    node_rows, node_shift = _between_rows(positions, -y)
     node_rows, node_shift = node_rows.movedim(-1, 0), (node_shift - x).movedim(-1, 0)  # (N, B, G, S)
     factors = torch.stack([weights.expand_as(y), weights * y]).to(by_x.real).movedim(-1, 0)[..., None, None]
 
