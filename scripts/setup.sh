@@ -27,6 +27,8 @@ case "$installed" in "$stamp $extras" | "$stamp test,benchmark,docs") current=tr
 if ! $current || ! .venv/bin/rsvib --version >/dev/null 2>&1; then
   echo "setup: installing into .venv (a few minutes the first time)"
   [ -x .venv/bin/python ] || "$python" -m venv .venv
-  .venv/bin/python -m pip install --quiet --disable-pip-version-check -c scripts/constraints.txt -e ".[$extras]"
+  # bytecode is made on all processors, because pip uses one; some templates in packages cannot be compiled
+  .venv/bin/python -m pip install --quiet --no-compile --disable-pip-version-check -c scripts/constraints.txt -e ".[$extras]"
+  .venv/bin/python -m compileall -q -j 0 .venv/lib > /dev/null || true
   printf '%s' "$stamp $extras" > .venv/installed
 fi

@@ -95,7 +95,8 @@ def refine(
     # 3. A long exposure can make the start choose the wrong side of a blind frequency: the other side is tried as well,
     # one axis after the other.
     blurred = frames.differently_blurred(motion_of_fit(shrunk(start, intervals), device))
-    tried = ~(blurred[:, None] | _is_nearly_blind(refined.fit, intervals))  # other axes count as tried
+    # other axes, and those of abandoned stacks, count as tried
+    tried = ~(blurred[:, None] | _is_nearly_blind(refined.fit, intervals)) | refined.abandoned[:, None]
     while not tried.all():
         frequencies, mirrored = mirrored_frequencies(refined.measurements, refined.fit, start, tried)
         if not mirrored.any():
@@ -104,7 +105,8 @@ def refine(
         active, index = strongest_only(refined.fit).active, np.flatnonzero(mirrored.any(-1))
         other, _ = robust_fit(refined.measurements, frequencies, active, start.drift_order)
         # a pattern that was subtracted does not appear again
-        again = _rounds(refined.frames.stacks(index), intervals, take_stacks([other], index), tones)
+        from_fit = take_stacks([other], index)
+        again = _rounds(refined.frames.stacks(index), intervals, from_fit, tones, may_abandon=may_abandon)
         refined = with_better(refined, again, index)
     # 4. Tones that the exact fit does not confirm are left out.
     if tones is None:
@@ -396,7 +398,10 @@ def _is_nearly_blind(fit: ToneFit, intervals: Array) -> Array:
 
 
 def with_better(first: FittedRows, second: FittedRows, index: Array) -> FittedRows:
-    """The result with another one of the stacks ``index`` where its residual in the typical row is smaller or known."""
+    """The result with another one of the stacks ``index`` where its residual in the typical row is smaller or known.
+
+    Abandoned stacks of the other one do not count.
+    """
     sizes = typical_size(first.measurements, first.fit)[index], typical_size(second.measurements, second.fit)
-    better = np.flatnonzero(sizes[1] < without_nan(sizes[0], np.inf))
+    better = np.flatnonzero((sizes[1] < without_nan(sizes[0], np.inf)) & ~second.abandoned)
     return replace(_with_stacks(first, take_stacks([second], better), index[better]), abandoned=first.abandoned)
