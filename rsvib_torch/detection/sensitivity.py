@@ -17,8 +17,7 @@ from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming, other_intervals
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.numerics.tables import Array, pseudo_inverse, split_axis, table, tables, tensor
-from rsvib_torch.results.presentation import AXIS_NAMES, Result, axis_head, axis_rows
-from rsvib_torch.text import text_table
+from rsvib_torch.results.presentation import AXIS_NAMES, Result
 
 _TONE_VALUES = ("amplitude", "frequency")  # quantities whose change by a wrong timing is stated
 _SENSITIVITY_SHAPES = {
@@ -47,23 +46,6 @@ class TimingSensitivity(Result, shapes=_SENSITIVITY_SHAPES):
     phase_by_row_time: Tensor  # d phi / d ln row_time in rad, at the time origin
     phase_by_frame_rows: Tensor  # d phi / d ln frame_rows
     phase_by_exposure_rows: Tensor  # d phi / d ln exposure_rows
-
-    def summary(self) -> str:
-        """Changes of every tone if a time is stated 1 % larger; of a batch, of the strongest one of each axis."""
-        shown = 1 if self.batch_shape else self.frequency_by_row_time.shape[-1]
-        rows = [
-            [
-                *labels,
-                str(tone + 1),
-                name,
-                *(f"{float(getattr(self, f'{of}_by_{name}')[at][tone]):+.2f}" for of in _TONE_VALUES),
-            ]
-            for at, labels in axis_rows(self.batch_shape)
-            for tone in range(shown)
-            if tone == 0 or float(self.frequency_by_row_time[at][tone]) != 0.0
-            for name in ("row_time", "frame_rows", "exposure_rows")
-        ]
-        return text_table([*axis_head(self.batch_shape), "tone", "1 % of", *(f"{of} (%)" for of in _TONE_VALUES)], rows)
 
 
 _STEP = 1e-4  # relative change of the timing, for differences

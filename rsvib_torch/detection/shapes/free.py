@@ -31,7 +31,7 @@ from rsvib_torch.detection.start import BandStart, FieldScale, band_start, camer
 from rsvib_torch.detection.tones.fit import ToneFit, fit_tones, fitted_again, motion_of_fit, residual_of
 from rsvib_torch.detection.tones.selection import find_tones, with_best_aliases
 from rsvib_torch.detection.tones.uncertainty import with_further_tones
-from rsvib_torch.detection.verdict import exposure_reasons, rotation_reasons, scene_reasons
+from rsvib_torch.detection.verdict import compared_bands, exposure_reasons, rotation_reasons, scene_reasons
 from rsvib_torch.execution.parallel import full_precision, threads_for, without_gradients
 from rsvib_torch.frames.entry_points import frames_options
 from rsvib_torch.frames.prepare import (
@@ -310,17 +310,16 @@ def _bands_reasons(start: BandStart, columns: int, motion: Motion, axes: int) ->
 
     Noise without a scene has offsets of any size, and rows that are measured around a fit to them confirm it.
     """
-    banded = start.measurements
-    found = banded.weights[0].min(-1) > 0
-    offsets, rest = (  # (N, 2) px, of the bands that were found
-        np.diff(values[0], axis=1)[found, 0] for values in (banded.displacements, residual_of_motion(banded, motion))
-    )
     # the pairs of frames one by one: one frame of noise, or of another scene, hardly changes the mean of all bands
-    of_pair = np.repeat(np.arange(len(start.curve.pairs)), len(start.curve.rows))[found]
-    pairs = [of_pair == pair for pair in np.unique(of_pair)]
-    spread = np.mean([np.abs(offsets[pair] - offsets[pair].mean(0)).mean(0) for pair in pairs], 0)
-    left, allowed = np.max([_typical(rest[pair]) for pair in pairs], 0), np.maximum(_MAX_BAND_ERROR, 0.3 * spread)  # px
-    against = scene_reasons(start.curve, columns, of_pairs=True)[0]
+    pairs, banded = start.curve.quality.shape[1:], start.measurements
+    offsets, rest = (
+        np.diff(values[0], axis=1).reshape(*pairs, 2)  # px
+        for values in (banded.displacements, residual_of_motion(banded, motion))
+    )
+    found = banded.weights[0].min(-1).reshape(pairs) > 0
+    bands = compared_bands(np.where(found[..., None], offsets, np.nan), offsets - rest, np.ones_like(found))
+    left, spread = np.nanmax(bands["residual"], 0), np.nanmean(bands["size"], 0)
+    against, allowed = scene_reasons(start.curve, columns, of_pairs=True)[0], np.maximum(_MAX_BAND_ERROR, 0.3 * spread)
     excess = left / allowed
     contradicted = {
         name: Reason("bands_contradict", name, float(left[axis]), float(allowed[axis]))
@@ -332,11 +331,6 @@ def _bands_reasons(start: BandStart, columns: int, motion: Motion, axes: int) ->
         [*against, *(reason for name, reason in contradicted.items() if of_all or name == axis)]
         for axis in AXIS_NAMES[:axes]
     ]
-
-
-def _typical(offsets: Array) -> Array:
-    """Mean (2,) of the smaller three quarters of offsets (N, 2) of bands: clouds may cover the others."""
-    return np.sort(np.abs(offsets), 0)[: math.ceil(0.75 * len(offsets))].mean(0)
 
 
 def _motion(fit: SplineFit, largest_drift: tuple[float, float] = (0.0, 0.0)) -> FreeMotion:
