@@ -13,7 +13,7 @@ from rsvib_torch import io, tracking, video
 from rsvib_torch.checks.values import NotNegative, options
 from rsvib_torch.commands.answers import without_curves
 from rsvib_torch.commands.flat_command import Given, argument, option
-from rsvib_torch.commands.shared_options import CameraOptions, check_file
+from rsvib_torch.commands.shared_options import CameraOptions, check_file, seconds
 from rsvib_torch.commands.terminal import Answer, warn
 from rsvib_torch.files.reading import Table
 from rsvib_torch.options import TrackerOptions, method_options
@@ -37,7 +37,7 @@ class LiveOptions(CameraOptions):
             forms={"method": {"show_default": "from the configuration, or dewarp"}},
         ),
     ]
-    steady: NotNegative = option(0.0, metavar="SECONDS")
+    steady: NotNegative = option(0.0, parser=seconds, metavar="SECONDS")
     """Stabilise the image to a straight line through the last part of its path."""
 
 

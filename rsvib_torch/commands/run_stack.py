@@ -13,12 +13,12 @@ from rsvib_torch import frames as preparation
 from rsvib_torch import report as reports
 from rsvib_torch.checks.values import fields_of, options
 from rsvib_torch.commands import answers
-from rsvib_torch.commands.flat_command import Given, argument
-from rsvib_torch.commands.shared_options import PixelSizeOptions, RestoringCommand, VerdictOptions
+from rsvib_torch.commands.flat_command import Given, argument, option
+from rsvib_torch.commands.shared_options import TIME, PixelSizeOptions, RestoringCommand, VerdictOptions
 from rsvib_torch.commands.terminal import Answer, current_output, warn, working
 from rsvib_torch.files.atomic import whole
 from rsvib_torch.files.reading import Table
-from rsvib_torch.options import ProcessVideoOptions, StackOptions
+from rsvib_torch.options import ProcessVideoOptions, StackOptions, WindowOptions
 from rsvib_torch.text import printable
 
 if TYPE_CHECKING:
@@ -33,13 +33,13 @@ class RunCommand(RestoringCommand, PixelSizeOptions, VerdictOptions):
 
     out: Path = argument()
     """Folder for the restored frames, the vibration and the figures."""
-    output: str = "restored.tif"
+    output: str | None = option(None, show_default="restored.tif, or a video")
     """Name of the restored stack in that folder; its extension selects the format, e.g. .mp4 or .mkv for a video with
     the time stamps and the sound of the input. restored/ is a folder with a file for each frame: from a folder of TIFF
     files, TIFF files of the same names and georeference."""
     video: bool = False
     """Write a video: restored.mp4 (H.264) from .mp4, restored.mov from .mov, else restored.mkv (FFV1, without loss).
-    Videos are followed frame by frame instead of in windows."""
+    Videos of more than 8 frames are followed frame by frame instead of in windows."""
     report: bool = False
     """Write report.html as well: a page with all figures, of the first window."""
     moved: Annotated[
@@ -49,7 +49,7 @@ class RunCommand(RestoringCommand, PixelSizeOptions, VerdictOptions):
             ("border", "steady", "crop_limit", "gyroscope", "lens_profile"),
             context="With --video, ",
             forms={
-                "steady": {"metavar": "SECONDS", "show_default": "the image stays where it is"},
+                "steady": {**TIME, "metavar": "SECONDS", "show_default": "the image stays where it is"},
                 "gyroscope": {"metavar": "FILE"},
                 "lens_profile": {"metavar": "FILE"},
             },
@@ -59,24 +59,21 @@ class RunCommand(RestoringCommand, PixelSizeOptions, VerdictOptions):
     @cached_property
     def restored(self) -> Path:
         """The restored stack."""
-        output = self.output.removesuffix("/")
         if self.moved and not self.video:
             raise ValueError(f"--{next(iter(self.moved)).replace('_', '-')} goes with --video")
-        if self.video:
-            if output != "restored.tif":
-                raise ValueError(
-                    f"--video and --output {output} are two names for the restored stack; give one of them"
-                )
-            ending = io.split_range(self.frames)[0].suffix.lower()
-            output = f"restored{ending if ending in io.H264 else '.mkv'}"
+        ending = io.split_range(self.frames)[0].suffix.lower()
+        usual = f"restored{ending if ending in io.H264 else '.mkv'}" if self.video else "restored.tif"
+        output = (self.output or usual).removesuffix("/")
+        if self.video and not output.lower().endswith((*io.H264, ".mkv")):
+            raise ValueError(f"--video writes .mp4, .mov, .m4v or .mkv, got --output {output}")
         if Path(output).name != output or output in ("", ".", ".."):
             raise ValueError(f"--output must be a file name without a folder, got {output!r}")
         return self.out / output
 
     @property
     def is_followed(self) -> bool:
-        """Whether a video of more than one window is processed from frame to frame."""
-        is_long_video = self.video and io.is_video(self.frames) and self.info.shape[0] > self.window
+        """Whether frames are followed one by one: those to be moved, and videos of more frames than a usual window."""
+        is_long_video = self.video and io.is_video(self.frames) and self.info.shape[0] > WindowOptions().window
         return bool(self.moved) or is_long_video
 
 
@@ -90,6 +87,8 @@ def run(given: RunCommand) -> Answer:
     """
     settings, out, restored = given.settings, given.out, given.restored  # a mistake in settings needs no torch
     answers.check_folder(out, _RESULTS, given.replaces, given.inputs, restored)
+    if given.is_followed and (given.force or "window" in given.processing):
+        raise ValueError(f"--{'force' if given.force else 'window'} has no effect on frames that --video follows")
     current_output().work = stacks.work_folder(restored)
     given.print_notes()
     # 1. The restored frames and their manifest.

@@ -31,9 +31,9 @@ _TIME_UNITS = {"": 1, "s": 1, "ms": 10**3, "us": 10**6, "µs": 10**6, "μs": 10*
 _LENGTH_UNITS = {"m": 1, "cm": 10**2, "mm": 10**3, "um": 10**6, "µm": 10**6, "μm": 10**6, "nm": 10**9}  # per metre
 
 
-def _with_unit(units: Mapping[str, int], expected: str, text: str) -> float:
+def _with_unit(units: Mapping[str, int], expected: str, text: object) -> float:
     """A number or a fraction with one of the units, which state how many of them are 1."""
-    stated = text.replace(" ", "")
+    stated = str(text).replace(" ", "")  # a default is a number
     unit = stated.lstrip("0123456789./eE+-")
     try:
         return float(Fraction(stated.removesuffix(unit)) / units[unit])

@@ -80,6 +80,8 @@ def motion(given: MotionCommand) -> Answer:
     To restore frames with the CSV file: rsvib restore --motion FILE --unit px --offset 0.
     """
     out, frames = given.out, given.frames
+    if out.suffix.lower() != ".csv":
+        raise ValueError(f"--out must be a .csv file, got {out}")
     shared.check_file(out, given.overwrite, given.inputs)
     pixels, timing = load(given)
     with working("detecting the motion"):
@@ -144,8 +146,8 @@ def restore(given: RestoreCommand) -> Answer:
     if vibration is not None and given.motion is None:
         of_recordings = ("offset", "unit", "ignore", "focal_length", "lens_profile")
         if useless := [name for name in of_recordings if getattr(given, name) not in (None, ())]:
-            option = useless[0].replace("_", "-")
-            raise ValueError(f"--{option} is for --motion, a recording; --vibration is that of the frames themselves")
+            name = useless[0].replace("_", "-")
+            raise ValueError(f"--{name} is for --motion, a recording; --vibration is that of the frames themselves")
         detected = reports.read_vibration(vibration, io.timing_from_first_frame(settings.timing, info))
         given.print_notes()
         of_run |= {"given": [detected], "window": max(2, info.shape[0])}

@@ -59,9 +59,10 @@ def _columns(path: Path, names: list[str]) -> tuple[list[int], set[str]]:
             what = "time" if quantity == "time" else f"rate about {quantity}"
             number = "no column" if not found else f"{len(found)} columns"
             present = one_line(", ".join(names) or "nothing", 200)
+            motion = " (a motion along x and y goes with --unit)" if {"x", "y"} <= {*names} else ""
             raise ValueError(
                 f"{path}: {number} of the {what}; expected one each, with names such as time, gx_rad_s, gy_rad_s, "
-                f"gz_rad_s in the line of names, which has {present}"
+                f"gz_rad_s in the line of names, which has {present}{motion}"
             )
         columns.append(found[0][0])
         if quantity != "time":

@@ -112,7 +112,8 @@ def write_stack(
             keep their values.
         like: The stack from which the frames were computed: its metadata, and of as many frames their times, are
             stored as far as the format supports them (``metadata_not_kept``), and NaN as its nodata value. Between
-            videos, the presentation times of the frames and the audio are copied. Its file must not be ``path``.
+            videos, the presentation times of the frames and the audio are copied. Its file must not be ``path``. A
+            video without times has 25 frames per second: ``like=StackInfo(..., frame_rate=rate)`` states another rate.
 
     Raises:
         OSError: If the file cannot be written.

@@ -67,7 +67,9 @@ def headline(report: Report) -> tuple[str, str]:
         mark, text = "bad", "Restoration does not improve the frames; they are unchanged."
     elif result is None:
         mark = "good" if totals["outcomes"].get("helps") == totals["windows"] else "doubt"
-        text = "The vibration changes; it was measured and removed by rsvib run."
+        is_video = windows is not None and "video" in windows.settings
+        what = "The camera was followed from frame to frame; its motion" if is_video else "The vibration changes; it"
+        text = f"{what} was measured and removed by rsvib run."
     elif report.outcome == "worse" or not bool(result.reliable.any()):
         mark = "bad"
         text = "The detected vibration is not reliable; inspect the restored frames before you use them."

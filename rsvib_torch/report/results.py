@@ -56,8 +56,12 @@ def check_same_timing(source: str, stored: SensorTiming, timing: SensorTiming) -
     theirs, ours = stored.to_dict(), timing.to_dict()
     different = [name for name in ours if not equal(theirs[name], ours[name])]
     if different:
-        values = ", ".join(f"{name}={theirs[name]!r} (here {ours[name]!r})" for name in different)
-        remedy = "detect it again, or correct [sensor]"
+        shown = [
+            [f"{one:.6g}" if isinstance(one, float) else repr(one) for one in both.values()] for both in (theirs, ours)
+        ]
+        texts = zip(ours, *shown, strict=True)
+        values = ", ".join(f"{name}={stored} (here {here})" for name, stored, here in texts if name in different)
+        remedy = "detect it again, or state the timing of the detection"
         raise ValueError(f"{source}: the vibration was detected with another timing: {values}; {remedy}")
 
 

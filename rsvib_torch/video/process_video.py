@@ -190,10 +190,10 @@ def _planned(source: Path, sink: Path, timing: SensorTiming, options: ProcessVid
     starts = starts - starts[0]
     # What the track of a GoPro video states of its frames. Rows are read at equal intervals, where exposures end:
     # frames of a longer exposure are exposed earlier in the mean.
-    whole, part = split_range(source)
-    track, exposures = read_camera_track(whole), None
+    path, used = split_range(source)
+    track, exposures = read_camera_track(path), None
     if track is not None and len(track.exposures):
-        begin = 0.0 if part is None else part[0] * job.timing.frame_period
+        begin = 0.0 if used is None else used[0] * job.timing.frame_period
         exposures = track.exposures_at(starts + begin)
         starts = starts - 0.5 * (exposures - job.timing.exposure_time)
         starts = starts - starts[0]

@@ -272,8 +272,7 @@ def video_motion(
             return Vibration(amplitude, frequency, phase, *polynomial)
 
         return VideoMotion(frames, path, found, by_corners, options.steady > 0)
-    for _ in found.pairs(progress):  # for ``found.compared``, and for ``found.corners``
-        pass
+    deque(found.pairs(progress), maxlen=0)  # all frames are followed, for ``found.compared`` and ``found.corners``
     tracks = tracks_of_pairs(found.compared, frames.starts.tolist(), timing, frames.size)
     aligned = align_rates(tracks, timing, rates, AlignOptions(camera=camera))
     if not aligned.reliable:

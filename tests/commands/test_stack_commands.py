@@ -142,6 +142,9 @@ def test_bad_frames_are_reported(place, tmp_path, capsys):
         (("--memory", "much"), "memory must be like '2GB' or '500MB', got 'much'"),
         (("--memory", "100MB"), "memory of 100 MB is too little: a window of 4 frames of 96 x 64 px takes about"),
         (("--output", "../restored.tif"), "--output must be a file name without a folder, got '../restored.tif'"),
+        (("--video", "--output", "x.tif"), "--video writes .mp4, .mov, .m4v or .mkv, got --output x.tif"),
+        (("--video", "--steady", "1s", "--window", 4), "--window has no effect on frames that --video follows"),
+        (("--video", "--steady", "1s", "--force"), "--force has no effect on frames that --video follows"),
     ],
 )
 def test_errors_are_one_line_and_leave_no_files(place, tmp_path, capsys, options, message):

@@ -360,6 +360,7 @@ def test_one_command_steadies_a_shaky_video_along_the_mean_of_its_path(shaky, tm
     text = (tmp_path / "out" / "report.html").read_text()
     assert "Frames 8 and 9," in text
     assert "Measured offsets" not in text
+    assert "The camera was followed from frame to frame" in text
     wrong = {
         steady: "results exist already",
         (*arguments[:3], *CAMERA, "--steady", "1"): "--steady goes with --video",
@@ -380,8 +381,9 @@ def test_frames_that_the_camera_has_stabilised_are_moved_as_a_whole(tmp_path, ca
     turned = [[0.9998, 0.0, 0.02, 0.0]] * 30
     add_track(clip, [packet(RATES[:20], total=20, turned=turned, exposures=[6e-4] * 30)] * 2)
     arguments = ("run", clip, tmp_path / "out", "--row-time", "150us", "--frame-rate", "30", "--video")
-    assert rsvib(*arguments, "--steady", "1", "--method", "dewarp", "--json") == 0
+    assert rsvib(*arguments, "--steady", "1s", "--method", "dewarp", "--output", "steady.mkv", "--json") == 0
     shown = capsys.readouterr()
+    assert len(read_stack(tmp_path / "out" / "steady.mkv")) == COUNT
     assert "the camera has stabilised the frames" in shown.err
     settings = read_manifest(tmp_path / "out" / "manifest.json").settings
     assert settings["video"]["stabilised"] is True
