@@ -15,7 +15,7 @@ from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.refinement import FittedRows, refine, with_better
 from rsvib_torch.detection.result import offset_curve
 from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_intervals
-from rsvib_torch.detection.rows.grouped_frames import grouped_frames, grouped_strips
+from rsvib_torch.detection.rows.grouped_frames import GroupedStrips, grouped_frames, grouped_strips
 from rsvib_torch.detection.start import BandStart, FieldScale, band_start, field_start
 from rsvib_torch.detection.tones.fit import (
     ToneFit,
@@ -203,7 +203,7 @@ def fit_directly(
             refined = with_better(refined, take_stacks([again], explained), index[explained])
     # Roll and zoom that were confirmed are fitted again in pairs, if the exposures blur the frames differently, and in
     # narrower strips, if the start did not show them: roll of 2 mrad in 256 columns had a bias of 0.4 %.
-    if not scale.same_for_all_columns and not bool(refined.abandoned.all()):
+    if isinstance(frames, GroupedStrips) and not bool(refined.abandoned.all()):
         motion = motion_of_fit(shrunk(refined.fit, intervals), stacks.images.device)
         if not frames.suits(motion) or (doubtful and frames.differently_blurred(motion).any()):
             frames = grouped_strips(stacks.images, stacks.valid, timing, motion, scale)

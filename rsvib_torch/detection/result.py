@@ -4,10 +4,8 @@ Detection works in row order with all components of the motion in px. A ``Detect
 in rad and zoom relative.
 """
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -33,9 +31,6 @@ from rsvib_torch.numerics.tables import Array
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.results.presentation import plain_values
 from rsvib_torch.results.reason import Findings
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -94,10 +89,6 @@ class DetectionResult(
         if self.timing is None:
             raise ValueError("timing unknown: replace(result, timing=SensorTiming(...)) has a spectrum")
         return displacement_spectrum(self.offsets, self.timing, self.vibration, self.fitted)
-
-    def plot_spectrum(self, path: str | os.PathLike[str] | None = None) -> "Figure":
-        """Draw ``spectrum``; ``path`` as in ``plot``."""
-        return self.spectrum().plot(path)
 
     def to_dict(self) -> Table:
         """All values as nested lists, numbers and texts, as in a ``vibration.json``; None for unknown numbers."""

@@ -144,7 +144,7 @@ def test_spectrum_as_table_and_figure(tmp_path):
     assert float(peak["velocity_x_um_per_s"]) == pytest.approx(5 * amplitude * 2 * math.pi * frequency)
     assert float(peak["acceleration_x_m_per_s2"]) == pytest.approx(5e-6 * amplitude * (2 * math.pi * frequency) ** 2)
     assert all(row["amplitude_x_px"] == "" for row in rows if row["blind"] == "True")
-    figure = found.plot_spectrum(tmp_path / "spectrum.png")
+    figure = found.spectrum().plot(tmp_path / "spectrum.png")
     assert (tmp_path / "spectrum.png").stat().st_size > 10_000
     labels = [text.get_text() for text in figure.axes[0].texts]
     assert labels[0].startswith("137.0 Hz\n0.8")

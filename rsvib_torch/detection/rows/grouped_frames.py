@@ -139,10 +139,6 @@ class GroupedFrames:
         """The frames without a pattern of columns."""
         return replace(self, groups=[replace(group, spectra=group.spectra.without(pattern)) for group in self.groups])
 
-    def suits(self, motion: Vibration) -> bool:
-        """Whether a motion changes little within the width of what is measured."""
-        return True
-
     def blur_ratio(self, motion: Vibration | FreeMotion) -> Tensor:
         """(B, 3) ratio, standard deviation and size as in ``displacements.blur_ratio``."""
         return blur_ratio(self.groups, self.timing, self.view(motion))
