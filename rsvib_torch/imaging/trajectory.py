@@ -68,10 +68,6 @@ def exposure_trajectory(
     return vibration.path(starts, nodes * timing.exposure_time), weights
 
 
-# at most: of 71 motions with |dY/dt| T_row of 0.5 to 0.9, all are right after 11 rounds; without halves of steps 11 not
-_SEARCH_ROUNDS = 16
-
-
 def rows_showing(
     scene_rows: Tensor, frame_start: Tensor, timing: RowTiming, vibration: Motion, exposure_time: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
@@ -85,15 +81,17 @@ def rows_showing(
     the sensor to (S, 1).
     """
     check_two_axes(vibration, "the displacement of a row")
-    scene_rows = scene_rows.to(torch.float64)
-    rows = scene_rows + torch.zeros_like(frame_start)
+    rows = scene_rows = scene_rows.to(torch.float64)
     near = torch.tensor([-1e-3, 0.0, 1e-3], dtype=torch.float64, device=rows.device)  # rows, for the derivative
     first = frame_start[..., None] + near * timing.row_time
     exposure = timing.exposure_time if exposure_time is None else exposure_time
-    least = last = rows  # |error| before the last step, and that step, if there was one
-    largest = 0.0  # px, largest step of Newton's method
-    for number in range(_SEARCH_ROUNDS):
+    step = least = last = torch.zeros_like(frame_start)
+    largest = 0.0  # px, step of Newton's method
+    for number in range(
+        16
+    ):  # of 71 motions with |dY/dt| T_row of 0.5 to 0.9, all need 11 at most; without halves 11 fail
         # 1. The error at the rows, and its derivative; the limit keeps steps finite near 0.
+        rows = rows + step
         of_rows = vibration.mean_displacement(torch.add(first, rows[..., None], alpha=timing.row_time), exposure)
         below, displacement, above = of_rows.unbind(-2)
         slope = (above - below) / 2e-3
@@ -102,7 +100,7 @@ def rows_showing(
         # 2. Each step is the square of the last one times the same number: end if the next one would be below 1e-6 px.
         size, change = error.detach().abs(), newton.detach()
         before, largest = largest, float(change.abs().max())
-        if largest**3 <= 1e-6 * (before**2 + 1e-12) or number == _SEARCH_ROUNDS - 1:
+        if largest**3 <= 1e-6 * (before**2 + 1e-12):
             break
         # 3. Newton's step; half of the last step back, where that step has increased the error.
         step = newton
@@ -110,7 +108,7 @@ def rows_showing(
             worse, half = size > least, 0.5 * last
             size, step = torch.where(worse, least, size), torch.where(worse, -half, newton)
             change = torch.where(worse, half, change)
-        rows, least, last = rows + step, size, change
+        least, last = size, change  # |error| before the step, and the step
     return rows + newton, displacement + slope * newton[..., None]
 
 
