@@ -445,7 +445,8 @@ def grey_frames(
         place, remedy = f"{frame}{of_stack(stack)}", "leave out this stack" if prepared.batched else "remove this frame"
         raise ValueError(f"{constant_frame(place)}; {remedy}")
     # a copy of a frame was exposed at another time than its place in the stack states
-    for stack, first in _repeated(images).nonzero().tolist():
+    equal = (images[:, 1:] == images[:, :-1]).flatten(2).all(-1)
+    for stack, first in (equal & ~equal.all(-1, keepdim=True)).nonzero().tolist():
         raise ValueError(
             f"frames {first} and {first + 1}{of_stack(stack)} are identical: one of them is a copy (video converters "
             "repeat frames), and its time is wrong; use frames without copies, e.g. NAME[0:100] of a file, or follow a "
@@ -472,9 +473,3 @@ def constant_frame(place: int | str) -> str:
 def is_constant(low: Tensor, high: Tensor) -> Tensor:
     """Whether the pixels between the lowest and the highest one are equal, to rounding."""
     return high - low <= 1e-6 * torch.maximum(low.abs(), high.abs())
-
-
-def _repeated(frames: Tensor) -> Tensor:
-    """(B, T - 1) bool: frames (B, T, C, H, W) that equal the next one; none in stacks whose frames are all equal."""
-    equal = (frames[:, 1:] == frames[:, :-1]).flatten(2).all(-1)
-    return equal & ~equal.all(-1, keepdim=True)

@@ -11,7 +11,6 @@ from statistics import NormalDist
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.execution.parallel import at_once, runs
@@ -195,15 +194,10 @@ def noise_levels(frames: Tensor, motion: FrameMotion, ignore: Tensor | None = No
     C, H, W) are in row order, with local means at pixels to ``ignore``.
     """
     alone = valid_mean(np.square(noise_deviation(frames, ignore)), -1)
-    alone[_constant(frames)] = math.nan
+    low, high = tables(*frames[..., ::8, :].flatten(2).aminmax(dim=-1))
+    alone[high - low <= 1e-6 * np.maximum(-low, high)] = math.nan  # equal to within rounding: not even noise
     high_pass = torch.as_tensor(alone, dtype=frames.dtype, device=frames.device)
     estimated = table(noise_of_frame_pair(frames, motion, ignore, high_pass))
     power = np.minimum(alone, without_nan(estimated, math.inf))
     power = without_nan(np.where(np.isnan(power), median(power, 1, keepdims=True), power), 0.0)
     return torch.as_tensor(np.sqrt(power), dtype=frames.dtype, device=frames.device)
-
-
-def _constant(frames: Tensor) -> NDArray[np.bool_]:
-    """Frames (B, T) whose values, in every eighth row, are equal to within rounding: they hold not even noise."""
-    low, high = tables(*frames[..., ::8, :].flatten(2).aminmax(dim=-1))
-    return high - low <= 1e-6 * np.maximum(-low, high)

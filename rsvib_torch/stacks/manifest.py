@@ -89,8 +89,10 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
 
         Phases refer to ``start_s``, the exposure start of the first row of the window.
         """
-        lines = []
-        for record, middle in zip(self.windows, self._middle_times(), strict=True):
+        lines, half_frame = [], self.timing.time_to_middle(self.input["shape"][self.timing.scan_axis])
+        starts = self.timing.frame_starts(self.windows[-1].last + 1).tolist()
+        for record in self.windows:
+            middle = 0.5 * (starts[record.first] + starts[record.last]) + half_frame  # of its frames
             first: Table = {"window": record.window, "first_frame": record.first, "last_frame": record.last}
             first |= {"start_s": record.start_time, "middle_time_s": middle}
             last: Table = {"equivalent": record.motion is not None, "frames": record.frames, "outcome": record.outcome}
@@ -99,12 +101,6 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
             tones = [{}] if record.detection is None else record.detection.tone_lines(pixel_size)
             lines += [{**first, **tone, **last} for tone in tones]
         return joined_columns(lines)
-
-    def _middle_times(self) -> list[float]:
-        """Middle of the frames of every window in s."""
-        half_frame = self.timing.time_to_middle(self.input["shape"][self.timing.scan_axis])
-        starts = self.timing.frame_starts(self.windows[-1].last + 1).tolist()
-        return [0.5 * (starts[record.first] + starts[record.last]) + half_frame for record in self.windows]
 
     @property
     def bad_frames(self) -> dict[str, str]:
