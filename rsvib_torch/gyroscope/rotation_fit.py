@@ -121,9 +121,8 @@ class Errors:
     depth: float  # standard deviation of m
     effects: Tensor  # (6,) px, of X, Y, radius theta, and of the deviations of the translation
     mean_translation: float  # px, prior of the mean translation
-    # factor on the variances of corners, whose errors are alike in a cell of the frame and in a pair, so that fewer of
-    # them are independent
-    alike: float = 1.0
+    # factor on the variances of corners, whose errors are correlated in a cell of the frame and in a pair
+    inflation: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,7 +222,7 @@ def _linear(fit: RotationFit, values: Tensor, slopes: Tensor, turned: Tensor) ->
     residual = torch.stack([residual[:, 0], residual[:, 1] - line], -1)
     return _Linear(
         residual,
-        errors.alike * torch.stack([torch.full_like(line, errors.sigma**2), errors.sigma**2 + spread], -1),
+        errors.inflation * torch.stack([torch.full_like(line, errors.sigma**2), errors.sigma**2 + spread], -1),
         torch.stack([errors.weight, errors.weight * errors.along_weight], -1),
         torch.cat([frame @ slopes, by_translation], -1),
         torch.cat([frame @ turned, by_translation], -1),
@@ -296,7 +295,7 @@ def _weighed(fit: RotationFit, linear: _Linear, of_effects: Tensor, follows: Ten
     effects = torch.minimum(torch.maximum(effects, old.effects / 3), old.effects * 3).clamp(min=_LEAST_STD)
     effects = torch.cat([effects[:3], old.effects[3:]]) if is_still else effects
     mean_translation = old.mean_translation if is_still else max(3 * excess**0.5, _LEAST_STD)
-    return Errors(weight, along_weight, sigma, depth, effects, mean_translation, old.alike)
+    return Errors(weight, along_weight, sigma, depth, effects, mean_translation, old.inflation)
 
 
 def _biweight(size: Tensor) -> Tensor:
@@ -335,11 +334,11 @@ def fit_robustly(model: RotationModel, start: Tensor) -> RotationFit:
     across = 1.4826 * float(off[still.errors.weight > 0].abs().median())
     simpler = across < (1 + _SIGNIFICANT / len(off) ** 0.5) * moving.errors.sigma
     fit = still if simpler else moving
-    # 4. Again with errors that are alike. Without this, the rows of a frame outweigh what all of them have in common:
-    # both halves of a recording of a phone (docs/gyroscope.md) had focal lengths of 566 +- 7 and 521 +- 14 px, and have
-    # 565 +- 3 and 562 +- 5 px; 0.09 instead of 0.13 px along y are not explained
-    alike = _with_correlated_errors(fit).inflation
-    return _with_correlated_errors(_weighted(replace(fit, errors=replace(fit.errors, alike=alike)), follows))
+    # 4. Again with correlated errors of corners. Without this, the rows of a frame outweigh what they have in common:
+    # halves of the recording of a phone (docs/gyroscope.md) had focal lengths of 566 +- 7 and 521 +- 14 px, now 565 +- 3
+    # and 562 +- 5 px, and 0.13 instead of 0.09 px along y were not explained
+    errors = replace(fit.errors, inflation=_with_correlated_errors(fit).inflation)
+    return _with_correlated_errors(_weighted(replace(fit, errors=errors), follows))
 
 
 def _weighted(fit: RotationFit, follows: Tensor) -> RotationFit:
