@@ -335,7 +335,7 @@ def fit_robustly(model: RotationModel, start: Tensor) -> RotationFit:
     simpler = across < (1 + _SIGNIFICANT / len(off) ** 0.5) * moving.errors.sigma
     fit = still if simpler else moving
     # 4. Again with correlated errors of corners. Without this, the rows of a frame outweigh what they have in common:
-    # halves of the recording of a phone (docs/gyroscope.md) had focal lengths of 566 +- 7 and 521 +- 14 px, and have 565
+    # halves of a phone's recording (docs/gyroscope.md) had focal lengths of 566 +- 7 and 521 +- 14 px, and have 565
     # +- 3 and 562 +- 5 px; 0.13 instead of 0.09 px along y were not explained
     errors = replace(fit.errors, inflation=_with_correlated_errors(fit).inflation)
     return _with_correlated_errors(_weighted(replace(fit, errors=errors), follows))
