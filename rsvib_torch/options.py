@@ -352,9 +352,10 @@ class ProcessVideoOptions(FileRunOptions, ResourceOptions):
     """Pixels that the sensor did not record: ``"mirror"``, extrapolated from each frame by itself; ``"crop"``, cut off
     by constant margins."""
     steady: NotNegative = 0.0
-    """Every frame is moved to a smooth path, and its skew and wobble are undone: shaking whose period is this time in s
-    or shorter is removed, slower motion is kept. 0: frames stay where they are, and only vibration is removed."""
-    crop_limit: Side = 0.1
+    """Every frame is moved to a smooth path, and its skew and wobble are undone: of shaking whose period is this time
+    in s or shorter, at most a sixteenth remains; slower motion is kept. 0: frames stay where they are, and only
+    vibration is removed."""
+    crop_limit: Side = 0.04
     """Largest displacement of a corner of a frame by ``steady``, in parts of the width or height; where the path would
     need more, it is smoothed less."""
     gyroscope: FilePath = None

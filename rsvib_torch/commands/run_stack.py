@@ -89,6 +89,8 @@ def run(given: RunCommand) -> Answer:
     answers.check_folder(out, _RESULTS, given.replaces, given.inputs, restored)
     if given.is_followed and (given.force or "window" in given.processing):
         raise ValueError(f"--{'force' if given.force else 'window'} has no effect on frames that --video follows")
+    if given.is_followed and settings.detection:
+        warn(f"{given.config}: [detection] has no effect on frames that --video follows")
     current_output().work = stacks.work_folder(restored)
     given.print_notes()
     # 1. The restored frames and their manifest.

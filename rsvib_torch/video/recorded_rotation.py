@@ -5,7 +5,10 @@ any size are composed exactly.
 """
 
 import math
+import operator
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import accumulate
 
 import numpy as np
 import torch
@@ -48,10 +51,31 @@ class RecordedRotation:
         rest = Rotation.from_rotvec(table(of_camera.rotation(of_camera.times[before], middles)))
         return cls(of_camera, found.motion.camera or Camera(found.focal_length), times, samples * rest)
 
-    def apart(self, number: int, others: slice) -> Array:
-        """(n, 4) components of the path from a frame to others: x, y (px), roll (rad), and a zoom of 0."""
-        moved = self._components(self.orientations[number].inv() * self.orientations[others])
-        return np.pad(moved, ((0, 0), (0, 1)))
+    @cached_property
+    def _axes(self) -> Rotation:
+        """(N) axes of the frames from those of ``path``.
+
+        They turn by half of the rotation from frame to frame: displacements S and T of neighbouring frames, whose
+        rotation is R, have the rotation ``R + T - S`` between them then, without ``(S + T) x R / 2``.
+        """
+        halves = Rotation.from_rotvec(0.5 * self._steps)
+        return Rotation.concatenate([*accumulate(halves, operator.mul, initial=Rotation.identity())])
+
+    @cached_property
+    def _steps(self) -> Array:
+        """(N - 1, 3) rotation vectors from frame to frame."""
+        return (self.orientations[:-1].inv() * self.orientations[1:]).as_rotvec()
+
+    @property
+    def path(self) -> Array:
+        """(N, 3) px at the focal length, sums of the rotation vectors from frame to frame."""
+        summed = np.cumsum(self._axes[:-1].apply(self._steps), 0)
+        return self.camera.focal_length * np.concatenate([np.zeros((1, 3)), summed])
+
+    def of_frames(self, shifts: Array) -> Array:
+        """(N, 4) components in the axes of every frame of displacements (N, 3) in those of ``path``."""
+        turned = Rotation.from_rotvec(self._axes.inv().apply(shifts) / self.camera.focal_length)
+        return np.pad(self._components(turned), ((0, 0), (0, 1)))
 
     def motion(self, number: int, shift: Array, reach: float) -> FreeMotion:
         """The motion up to ``reach`` in s from the middle of a frame, its time origin, where it is ``shift`` (4,)."""

@@ -249,17 +249,17 @@ def video_motion(
 
     With the ``rates`` of a gyroscope, its rotation is the path; the focal length is that of the ``camera``, or fitted.
     """
-    found, timing, middles = FirstPass(frames, for_gyroscope=rates is not None), frames.job.timing, frames.middles
+    found, timing = FirstPass(frames, for_gyroscope=rates is not None), frames.job.timing
 
-    def to_steady(apart: Callable[[int, slice], Array]) -> Array:
-        return steady_shifts(middles, apart, options.steady, frames.size, options.crop_limit)
+    def to_steady(path: Array, of_frames: Callable[[Array], Array] = np.asarray) -> Array:
+        return steady_shifts(frames.middles, path, options.steady, frames.size, options.crop_limit, of_frames)
 
     if rates is None:
         with ONE_BLAS_THREAD:
             path = camera_path(found.pairs(progress), timing, frames.size, has_tones=not frames.stabilised)
         places = path.places(found.taken)
         _check_repetitions(found.repetitions, places[:, :2])
-        shift = to_steady(lambda number, others: places[others] - places[number])
+        shift = to_steady(places)
         polynomials = np.stack([path.derivatives(found.taken, 1), path.derivatives(found.taken, 2), shift], 1)
         polynomials[:, :2] *= not frames.stabilised
 
@@ -279,7 +279,8 @@ def video_motion(
         reasons = "; ".join(aligned.reasons)
         raise ValueError(f"the gyroscope ({rates.source}) does not fit the video: {reasons}")
     rotation = RecordedRotation.aligned(rates, aligned, found.taken)
-    turned, half = to_steady(rotation.apart), timing.time_to_middle(frames.size[int(timing.scan_axis)])
+    turned = to_steady(rotation.path, rotation.of_frames)
+    half = timing.time_to_middle(frames.size[int(timing.scan_axis)])
     return VideoMotion(
         frames, aligned, found, lambda index: rotation.motion(index, turned[index], half), options.steady > 0
     )

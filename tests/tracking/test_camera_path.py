@@ -329,7 +329,7 @@ def test_the_smooth_path_keeps_slow_motion_and_the_limit():
     places = hand(times).T
 
     def shifts(duration, limit):
-        return steady_shifts(times, lambda one, others: places[others] - places[one], duration, (HEIGHT, WIDTH), limit)
+        return steady_shifts(times, places, duration, (HEIGHT, WIDTH), limit)
 
     steady = places - shifts(0.5, 0.4)
     jitter = [np.abs(np.diff(path[:, :2], 3, axis=0)).mean() for path in (places, steady)]

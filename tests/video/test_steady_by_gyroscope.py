@@ -116,7 +116,7 @@ def test_a_pan_of_any_angle_is_kept():
     shaken = pan * Rotation.from_rotvec(angle[:, None] * [1.0, 0.0, 2.0])
     rates = rsv.AngularRates(torch.arange(8.0), torch.zeros(8, 3))
     path = RecordedRotation(rates, rsv.Camera(500.0), times, shaken)
-    moved = steady_shifts(times, path.apart, 1 / 3, (360, 640), 0.1)[15:-15]
-    expected = angle[15:-15, None] * [0.0, 500.0, -2.0, 0.0]
+    moved = steady_shifts(times, path.path, 0.5, (360, 640), 0.1, path.of_frames)[30:-30]
+    expected = angle[30:-30, None] * [0.0, 500.0, -2.0, 0.0]
     assert np.abs(expected).max() > 4  # px
     assert np.abs((moved - expected) * [1, 1, 300, 1]).max() < 0.1  # px, at the border of the frame
