@@ -26,7 +26,7 @@ from rsvib_torch.numerics.tables import Array, median, split_axis, without_nan
 # A tone that sweeps by 2 Hz/s changes by 12.6 rad/s in a second; a tone that grows to twice its amplitude has 0.7 / s.
 # A camera held by hand shakes by 2 px at 3 Hz, which are 13000 px/s^3. Measured in docs/live.md.
 PROCESS_NOISE = ((0.00003, 200.0), (0.00003, 4000.0), (0.5, 200.0), (12.0, 1200.0))
-_STAY = 0.95  # probability that the process noise of the next frame is the same
+_STAY = 0.995  # probability that the process noise of the next frame is the same
 # Standard deviations at the start, px/s and px/s^2 (tones and drift are correlated, their sum is more accurate), and
 # 1/s: amplitudes that double within a second or two are followed
 _DRIFT_STD, _GROWTH_STD = (10.0, 500.0), 1.0
