@@ -252,8 +252,8 @@ class RestorationOptions(ExactOptions, BandedOptions, DewarpOptions, RichardsonL
         for group in METHOD_OPTIONS.values():
             for name, field in fields_of(group).items():
                 if name not in names and getattr(self, name) != field.default:
-                    own = f"; its options are {', '.join(names)}" if names else ", which has none"
-                    raise ValueError(f"{name} is no option of method={self.method!r}{own}")
+                    known_options = f"; its options are {', '.join(names)}" if names else ", which has none"
+                    raise ValueError(f"{name} is no option of method={self.method!r}{known_options}")
 
 
 @options

@@ -100,7 +100,7 @@ def mistakes_of(error: ValidationError, data: object, path: str = "", group: obj
 
     If the data are those of a ``group`` of options, errors of unknown keys list the options.
     """
-    found: dict[tuple[str | int, ...], list[ErrorDetails]] = {}
+    errors_of_keys: dict[tuple[str | int, ...], list[ErrorDetails]] = {}
     for entry in error.errors(include_url=False):
         keys: tuple[str | int, ...] = ()
         value = data
@@ -109,8 +109,8 @@ def mistakes_of(error: ValidationError, data: object, path: str = "", group: obj
                 keys, value = (*keys, step), value.get(step)
             elif isinstance(value, (list, tuple)) and isinstance(step, int):
                 keys, value = (*keys, step), value[step] if step < len(value) else None
-        found.setdefault(keys, []).append(entry)
-    return [_explained(path, keys, entries, group) for keys, entries in found.items()]
+        errors_of_keys.setdefault(keys, []).append(entry)
+    return [_explained(path, keys, entries, group) for keys, entries in errors_of_keys.items()]
 
 
 def _explained(path: str, keys: Sequence[str | int], entries: list[ErrorDetails], group: object) -> Exception:

@@ -33,18 +33,18 @@ def without_curves(result: Result) -> Table:
     return {name: value for name, value in result.to_dict().items() if name not in curves}
 
 
-def verdicts(found: Sequence[DetectedVibration | detection.MotionDetection | None]) -> dict[str, bool]:
+def verdicts(detections: Sequence[DetectedVibration | detection.MotionDetection | None]) -> dict[str, bool]:
     """Whether each axis is reliable in all detections; None is one that failed."""
-    flags = [[] if one is None else one.reliable.tolist() for one in found]
+    flags = [[] if one is None else one.reliable.tolist() for one in detections]
     return {name: all(of_one[axis : axis + 1] == [True] for of_one in flags) for axis, name in enumerate(AXES)}
 
 
-def stack_answer(frames: Path, found: detection.DetectionResult, pixel_size: float | None = None) -> Answer:
+def stack_answer(frames: Path, result: detection.DetectionResult, pixel_size: float | None = None) -> Answer:
     """The vibration in a stack, also in units of length if the size of a pixel in m is given."""
-    answer = Answer({f"Vibration in {frames.name}": [found.summary()]}, {"detection": without_curves(found)})
-    answer.reliable = verdicts([found])
+    answer = Answer({f"Vibration in {frames.name}": [result.summary()]}, {"detection": without_curves(result)})
+    answer.reliable = verdicts([result])
     if pixel_size is not None:
-        answer.results[f"For pixels of {1e6 * pixel_size:.6g} µm"] = [found.physical_summary(pixel_size)]
+        answer.results[f"For pixels of {1e6 * pixel_size:.6g} µm"] = [result.physical_summary(pixel_size)]
     return answer
 
 

@@ -92,8 +92,8 @@ def _row_time_of(camera: str, info: "StackInfo", values: Table) -> tuple[dict[st
     rows, columns = info.shape[-2:] if values.get("scan_axis") != "x" else info.shape[:-3:-1]
     mode = camera_mode(camera, width=columns, height=rows, frame_rate=values["frame_rate"])
     time = measured_text(1e6 * mode.row_time, 1e6 * mode.row_time_std)
-    found = {"row_time": mode.row_time, "row_time_std": mode.row_time_std}
-    return found, f"row time {time} us, from gyroflow/lens_profiles: {mode}"
+    sensor = {"row_time": mode.row_time, "row_time_std": mode.row_time_std}
+    return sensor, f"row time {time} us, from gyroflow/lens_profiles: {mode}"
 
 
 def _describe_camera(path: Path, given: Table, camera: str | None) -> str:

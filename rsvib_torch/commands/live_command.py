@@ -116,11 +116,11 @@ def _answer(source: str, report: video.LiveReport, files: list[Path], *, waits: 
         )
     if report.predicted:
         lines.append(f"{number_of(report.predicted, 'late frame')} predicted instead of measured")
-    found = report.detection
+    last = report.detection
     names = ("frames", "tracked", "corrected", "predicted", "unusable", "dropped", "lost", "detections", "seconds")
     data = {name: getattr(report, name) for name in names} | delays
-    data["detection"] = None if found is None else without_curves(found)
+    data["detection"] = None if last is None else without_curves(last)
     results = {f"Live frames of {source}": lines}
-    if found is not None:
-        results["Vibration at the last frame"] = [found.summary()]
+    if last is not None:
+        results["Vibration at the last frame"] = [last.summary()]
     return Answer(results, data, files)

@@ -99,8 +99,8 @@ def run(given: RunCommand) -> Answer:
     stored = stacks.read_manifest(result.manifest)
     # 2. Tables and figures of one vibration of all frames, or of the windows; the page.
     page = _page(given, stored, result.detection or _first_detection(given, stored))
-    found = page.detection if page.windows is None else None
-    answer = _answer(given, found, stored)
+    detected = page.detection if page.windows is None else None
+    answer = _answer(given, detected, stored)
     answer.results["Restoration"] = answers.restoration_lines(result, stored)
     with whole(out, "folder") as folder:
         names = [restored.name] if given.is_followed else []
@@ -109,8 +109,8 @@ def run(given: RunCommand) -> Answer:
                 reports.save_figure(reports.frames_figure(page), folder / "before_after.png")
             names.append("before_after.png")
         names += [*([] if given.is_followed else [restored.name]), "manifest.json"]
-        if found is not None:
-            names += answers.write_detection(folder, found, page.timing, given.pixel_size)
+        if detected is not None:
+            names += answers.write_detection(folder, detected, page.timing, given.pixel_size)
         else:
             names += answers.write_windows(folder, stored, given.pixel_size)
         if given.report:
@@ -135,7 +135,7 @@ def _first_detection(given: RunCommand, stored: stacks.StackManifest) -> Detecte
     return stacks.first_detection(given.frames, given.settings.timing, StackOptions(**of_windows))
 
 
-def _page(given: RunCommand, stored: stacks.StackManifest, found: DetectedVibration | None) -> reports.Report:
+def _page(given: RunCommand, stored: stacks.StackManifest, first: DetectedVibration | None) -> reports.Report:
     """The page of a run: usable frames of the first window, of a video two neighbours; without a page, one frame."""
     # 1. The frames that are shown; of an image that was restored jointly from all, the middle one of the input.
     record, bad, restoration = stored.windows[0], stored.bad_frames, given.of_stack["restoration"]
@@ -160,7 +160,7 @@ def _page(given: RunCommand, stored: stacks.StackManifest, found: DetectedVibrat
         scale = None if io.is_video(given.restored) else given.scale
         after = io.read_frames(given.restored, [0] if joint else shown, scale)
     # 3. What was found in them.
-    detected = found if isinstance(found, detection.DetectionResult) else None  # of a steady vibration
+    detected = first if isinstance(first, detection.DetectionResult) else None  # of a steady vibration
     alone = detected is not None and len(stored.windows) == 1
     timing = io.timing_from_first_frame(given.settings.timing, given.info)
     return reports.Report(
@@ -177,12 +177,12 @@ def _page(given: RunCommand, stored: stacks.StackManifest, found: DetectedVibrat
     )
 
 
-def _answer(given: RunCommand, found: detection.DetectionResult | None, stored: stacks.StackManifest) -> Answer:
+def _answer(given: RunCommand, detected: detection.DetectionResult | None, stored: stacks.StackManifest) -> Answer:
     """The answer about one vibration of all frames, or about the windows, with steps and warnings about a video."""
-    if found is not None:
-        answer = answers.stack_answer(given.frames, found, given.pixel_size)
+    if detected is not None:
+        answer = answers.stack_answer(given.frames, detected, given.pixel_size)
         answer.data["restoration"] = stored.totals()
-        answer.next_steps = answers.steps_after_detection(found, given.frames, given.settings)
+        answer.next_steps = answers.steps_after_detection(detected, given.frames, given.settings)
     else:
         answer = Answer({f"Vibration in {given.frames.name}": stored.lines()[0]}, {"windows": stored.totals()})
         answer.reliable = answers.verdicts([record.detection for record in stored.windows])

@@ -287,8 +287,8 @@ def check_new(
     check_outputs(paths, sources, folder=folder)
     existing = [path for path in paths if os.path.lexists(path) and not (path.is_dir() and not any(path.iterdir()))]
     if existing and not overwrite:
-        found = f"results exist already in {existing[0].parent}: {', '.join(path.name for path in existing)}"
-        raise FileExistsError(f"{found}; choose another name, or replace them with --overwrite")
+        problem = f"results exist already in {existing[0].parent}: {', '.join(path.name for path in existing)}"
+        raise FileExistsError(f"{problem}; choose another name, or replace them with --overwrite")
 
 
 def check_file(path: Path, overwrite: bool, inputs: Iterable[Path | None]) -> None:

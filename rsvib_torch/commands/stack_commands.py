@@ -181,14 +181,14 @@ def _motion_of_frames(given: RestoreCommand, path: Path, info: StackInfo, answer
     elif given.focal_length is not None:
         camera = rsvib_torch.Camera(given.focal_length)
     with working("aligning the recording"):
-        found = stacks.align_stack(given.frames, info, timing, recorded, camera=camera, ignore=ignore)
-    answer.results["Recording on the clock of the frames"] = [found.summary()]
-    answer.data["alignment"] = answers.without_curves(found)
-    if found.reasons and not given.force:
-        raise ValueError(f"{path}: {'; '.join(found.reasons)}; --force restores with it nevertheless")
-    for reason in found.reasons:
+        alignment = stacks.align_stack(given.frames, info, timing, recorded, camera=camera, ignore=ignore)
+    answer.results["Recording on the clock of the frames"] = [alignment.summary()]
+    answer.data["alignment"] = answers.without_curves(alignment)
+    if alignment.reasons and not given.force:
+        raise ValueError(f"{path}: {'; '.join(alignment.reasons)}; --force restores with it nevertheless")
+    for reason in alignment.reasons:
         warn(reason)
-    return found.motion
+    return alignment.motion
 
 
 def _recorded(given: RestoreCommand, path: Path) -> rsvib_torch.FreeMotion | rsvib_torch.AngularRates:

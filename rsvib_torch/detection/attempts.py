@@ -86,19 +86,19 @@ def detect_tones(
     return replace(result, reliable=reliable, findings=tuple(findings))
 
 
-def _assembled(found: Attempt, timing: SensorTiming, num_frames: int) -> DetectionResult:
+def _assembled(result: Attempt, timing: SensorTiming, num_frames: int) -> DetectionResult:
     """The results of an attempt in image axes."""
-    fitted = found.fitted
+    fitted = result.fitted
     return assembled(
-        found.fit,
-        found.std,
-        found.std_if_hidden_tone,
+        result.fit,
+        result.std,
+        result.std_if_hidden_tone,
         (fitted.offsets, fitted.predicted),
-        found.findings,
+        result.findings,
         timing,
-        scale=found.scale,
+        scale=result.scale,
         num_frames=num_frames,
-        interval=found.interval,
+        interval=result.interval,
         blur=None if fitted.refined is None else fitted.refined.other_motion.blur,
     )
 
@@ -110,35 +110,35 @@ _MOVES_BY_ITSELF, _MOST_MOVING = 0.1, 0.7
 
 
 def _without_moving_parts(
-    stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, found: Attempt, where: Array
+    stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, result: Attempt, where: Array
 ) -> tuple[GreyFrames, Attempt]:
     """Stacks without the parts of the frames that move by themselves, and their attempt, if it refuses fewer axes.
 
     Rows that clouds or objects cover in part have a displacement between both motions. It is tried for the stacks
     ``where`` (B,) is true and the halves of the rows move apart.
     """
-    refined = found.fitted.refined
+    refined = result.fitted.refined
     if refined is None:
-        return stacks, found
+        return stacks, result
     where = where & halves_move_apart(refined.other_motion)
     if not where.any():
-        return stacks, found
+        return stacks, result
     # 1. The stacks in which some parts, but not most of them, move by themselves, without these.
     moving = _moving_parts(refined, timing, stacks)
     share = moving.mean((1, 2, 3))
     where = where & (share > 0) & (share < _MOST_MOVING)
     if not where.any():
-        return stacks, found
+        return stacks, result
     part = stacks.some(where).only(~moving[where])
-    other = attempt(part, timing, options, Hypothesis(found.scale, is_doubtful=True))
+    other = attempt(part, timing, options, Hypothesis(result.scale, is_doubtful=True))
     # 2. All stacks, without these parts where that refuses fewer axes.
     for index, against in zip(np.flatnonzero(where).tolist(), other.findings, strict=True):
-        where[index] = sum(map(bool, against)) < sum(map(bool, found.findings[index]))
+        where[index] = sum(map(bool, against)) < sum(map(bool, result.findings[index]))
     if not where.any():
-        return stacks, found
+        return stacks, result
     if not where.all():
         part = stacks.only(~(moving & where[:, None, None, None]))
-        other = attempt(part, timing, options, Hypothesis(found.scale))
+        other = attempt(part, timing, options, Hypothesis(result.scale))
     return part, other
 
 
@@ -169,7 +169,7 @@ def _moving_parts(refined: FittedRows, timing: RowTiming, stacks: GreyFrames) ->
 _MAX_UNLIKE, _MAX_UNLIKE_PX = 0.01, 0.01
 
 
-def _without_parallax(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, found: Attempt) -> Attempt:
+def _without_parallax(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, result: Attempt) -> Attempt:
     """The attempt without the reason that the halves of the rows move apart, for stacks whose halves vibrate alike.
 
     Roll moves the halves of a row apart along y and zoom along x, so that their tones differ. A uniform roll or zoom
@@ -177,17 +177,17 @@ def _without_parallax(stacks: GreyFrames, timing: RowTiming, options: DetectionO
     """
     num_frames, height, width = stacks.images.shape[1:]
     half = width // 2
-    if found.fitted.refined is None or num_frames < 3 or not fits_frame(height, half, options.bands):
-        return found
+    if result.fitted.refined is None or num_frames < 3 or not fits_frame(height, half, options.bands):
+        return result
     row_starts = table(timing.row_starts(num_frames, height)[:, ::8].flatten())
-    findings = list(found.findings)
-    for index, against in enumerate(found.findings):
+    findings = list(result.findings)
+    for index, against in enumerate(result.findings):
         # 1. Stacks that are refused along an axis for this reason only.
         if not any({reason.code for reason in of_axis} == {"halves_apart"} for of_axis in against):
             continue
         # 2. Each half must be reliable along both axes, with the displacements of the whole.
         stack = stacks.one(index)
-        whole = tone_displacements(found.fit, row_starts, timing.exposure_time)[index]
+        whole = tone_displacements(result.fit, row_starts, timing.exposure_time)[index]
         allowed = np.maximum(_MAX_UNLIKE * whole.std(0), _MAX_UNLIKE_PX)
         for part in (slice(0, half), slice(width - half, width)):
             of_half = attempt(stack.columns(part), timing, options, Hypothesis(FieldScale(2, half, height)))
@@ -198,11 +198,11 @@ def _without_parallax(stacks: GreyFrames, timing: RowTiming, options: DetectionO
             findings[index] = tuple(
                 tuple(reason for reason in of_axis if reason.code != "halves_apart") for of_axis in against
             )
-    return replace(found, findings=tuple(findings))
+    return replace(result, findings=tuple(findings))
 
 
-def _moving_axes(found: Attempt, least: int) -> int:
+def _moving_axes(result: Attempt, least: int) -> int:
     """Number of components up to the last one with a significant tone in any stack, at least ``least``."""
-    significant = found.vibration.amplitude > MIN_SIGNIFICANCE * found.std_if_hidden_tone.amplitude
+    significant = result.vibration.amplitude > MIN_SIGNIFICANCE * result.std_if_hidden_tone.amplitude
     moving = significant.any(0).any(-1).tolist()
     return max([least, *(axis + 1 for axis in range(2, len(moving)) if moving[axis])])

@@ -35,25 +35,25 @@ from rsvib_torch.results.reason import Reason
 _MOST_TRIED = 3
 
 
-def other_timings(stacks: GreyFrames, timing: SensorTiming, found: Attempt) -> dict[int, Reason]:
+def other_timings(stacks: GreyFrames, timing: SensorTiming, result: Attempt) -> dict[int, Reason]:
     """The reasons against all axes of stacks that agree with another timing than the attempt, by index of the stack."""
-    if found.fitted.refined is None:
+    if result.fitted.refined is None:
         return {}
-    diagnoses, rotates = {}, halves_move_apart(found.fitted.refined.other_motion).tolist()
-    for index in range(len(found.findings)):
-        diagnosis = _diagnosis(stacks.one(index), timing, found, index, rotates=rotates[index])
+    diagnoses, rotates = {}, halves_move_apart(result.fitted.refined.other_motion).tolist()
+    for index in range(len(result.findings)):
+        diagnosis = _diagnosis(stacks.one(index), timing, result, index, rotates=rotates[index])
         if diagnosis is not None:
             diagnoses[index] = diagnosis
     return diagnoses
 
 
-def _diagnosis(stack: GreyFrames, timing: SensorTiming, found: Attempt, index: int, *, rotates: bool) -> Reason | None:
+def _diagnosis(stack: GreyFrames, timing: SensorTiming, result: Attempt, index: int, *, rotates: bool) -> Reason | None:
     """The reason against all axes of a stack that agrees with another timing; None if it agrees with none.
 
     ``rotates``: whether the halves of the rows move apart.
     """
     # 1. The axes that contradict the stated timing, or, if only their tones do, all that are refused for nothing else.
-    findings = found.findings[index][:2]
+    findings = result.findings[index][:2]
     contradicted = contradicted_axes(findings)
     concerned = contradicted
     if not any(contradicted):
@@ -62,12 +62,12 @@ def _diagnosis(stack: GreyFrames, timing: SensorTiming, found: Attempt, index: i
         return None
     # 2. The first of the candidates with which detection is reliable along these axes. Tones that are found with one of
     # them may agree with a better one.
-    candidates, tried = _candidates(stack, timing, found, index, any(contradicted), rotates=rotates), 0
+    candidates, tried = _candidates(stack, timing, result, index, any(contradicted), rotates=rotates), 0
     while candidates and tried < _MOST_TRIED:
         candidate, tried = candidates.pop(0), tried + 1
         turned, row_timing = stack.with_timing(candidate), candidate.in_row_order()
         scale = FieldScale(2, turned.images.shape[-1], turned.images.shape[-2])
-        other = attempt(turned, row_timing, found.options, Hypothesis(scale, is_doubtful=True))
+        other = attempt(turned, row_timing, result.options, Hypothesis(scale, is_doubtful=True))
         if other.abandoned[0]:
             continue
         starts = table(candidate.frame_starts(stack.images.shape[1]))
@@ -82,22 +82,22 @@ def _diagnosis(stack: GreyFrames, timing: SensorTiming, found: Attempt, index: i
 
 
 def _candidates(
-    stack: GreyFrames, timing: SensorTiming, found: Attempt, index: int, contradicted: bool, *, rotates: bool
+    stack: GreyFrames, timing: SensorTiming, result: Attempt, index: int, contradicted: bool, *, rotates: bool
 ) -> list[SensorTiming]:
     """Timings with which one stack may agree; ``contradicted``: whether its rows contradict the stated one."""
     num_frames, height, width = stack.images.shape[1:]
     candidates: list[SensorTiming] = []
     if num_frames > 2:
         one, row_timing, starts = np.array([index]), timing.in_row_order(), table(timing.frame_starts(num_frames))
-        measurements, fit = take_stacks([found.fitted.measurements], one), take_stacks([found.fitted.fit], one)
+        measurements, fit = take_stacks([result.fitted.measurements], one), take_stacks([result.fitted.fit], one)
         candidates += _with_period(timing, measured_period(measurements, fit, starts), height)
         if contradicted:
             factor = searched_period(measurements, row_timing, starts)
             candidates += _with_period(timing, factor, height)
             if factor is None and timing.frame_start_times is None:
-                first = first_after_gap(take_stacks([found.start.measurements], one), row_timing, starts)
+                first = first_after_gap(take_stacks([result.start.measurements], one), row_timing, starts)
                 candidates += [] if first is None else [with_lost_frame(timing, num_frames, first)]
-    if contradicted and rotates and width <= timing.frame_rows and fits_frame(width, height, found.options.bands):
+    if contradicted and rotates and width <= timing.frame_rows and fits_frame(width, height, result.options.bands):
         candidates.append(replace(timing, scan_axis="x" if timing.scan_axis == -2 else "y"))
     return candidates
 
@@ -227,10 +227,10 @@ def searched_period(measurements: Measurements, timing: RowTiming, starts: Array
     factors, frequencies, step = coarse[minima], frequencies[minima], _STEP
     for _ in range(_LEVELS):
         near = factors[:, None] + step * np.linspace(-1.0, 1.0, _POINTS)
-        sizes, found = fits(near.ravel(), _ROWS[1], np.repeat(frequencies, _POINTS, 0))
-        sizes, found = sizes.reshape(near.shape), split_axis(found, 0, *near.shape)
+        sizes, fitted = fits(near.ravel(), _ROWS[1], np.repeat(frequencies, _POINTS, 0))
+        sizes, fitted = sizes.reshape(near.shape), split_axis(fitted, 0, *near.shape)
         best = np.arange(len(near)), sizes.argmin(1)
-        least, factors, frequencies = sizes[best], near[best], found[best]
+        least, factors, frequencies = sizes[best], near[best], fitted[best]
         step /= 4.0
         if (least >= _SMALLER * stated).all():
             return None

@@ -84,10 +84,10 @@ def refine(
     for _ in range(2):
         motion = motion_of_fit(shrunk(refined.fit, intervals), device)
         pattern = refined.frames.column_pattern(motion, refined.row_variance)
-        found = table((pattern != 0).any(-1)).reshape(len(refined.abandoned), -1).any(1) & ~refined.abandoned
-        if not found.any():
+        has_pattern = table((pattern != 0).any(-1)).reshape(len(refined.abandoned), -1).any(1) & ~refined.abandoned
+        if not has_pattern.any():
             break
-        index = np.flatnonzero(found)
+        index = np.flatnonzero(has_pattern)
         cleaned = refined.frames.without(pattern)
         from_fit = take_stacks([refined.fit], index)
         again = _rounds(cleaned.stacks(index), intervals, from_fit, tones, search_round=0)

@@ -140,11 +140,11 @@ def displacement_spectrum(
     spacing = max(spacing, *curve.heights)
     step = 0.5 / float(measured.span[0])
     frequency = step * np.arange(2, max(math.floor(0.5 / (spacing * timing.row_time) / step), 8) + 1)
-    found = [
+    spectra = [
         _spectrum(measured.of_axis(axis), frequency, _lines_of(vibration, axis, measured.centre))
         for axis in range(measured.displacements.shape[-1])
     ]
-    amplitudes, noises, lines, responses = zip(*found, strict=True)
+    amplitudes, noises, lines, responses = zip(*spectra, strict=True)
     # a frequency is blind if it is for any axis
     blind = np.any([response < _BLIND_GAIN * response.max() for response in responses], 0)
     return DisplacementSpectrum(

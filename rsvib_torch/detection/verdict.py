@@ -155,8 +155,9 @@ def scene_reasons(curve: OffsetCurve, columns: int, *, of_pairs: bool = False) -
     registered, similar = curve.good.double().mean((1, 2)), similar_share(curve, columns)
     of_stacks = similar.amin(-1) if of_pairs else similar.mean(-1)
     against, what = list[list[Reason]](), {"what": "the row bands of two frames" if of_pairs else "the row bands"}
-    for share_similar, found in zip(of_stacks.tolist(), registered.tolist(), strict=True):
-        share, limit = (found, _MIN_REGISTERED) if found < _MIN_REGISTERED else (share_similar, _MIN_MEASURED)
+    for share_similar, share_registered in zip(of_stacks.tolist(), registered.tolist(), strict=True):
+        too_few = share_registered < _MIN_REGISTERED
+        share, limit = (share_registered, _MIN_REGISTERED) if too_few else (share_similar, _MIN_MEASURED)
         against.append([Reason("rows_not_registered", None, share, limit, what)] if share < limit else [])
     return against
 

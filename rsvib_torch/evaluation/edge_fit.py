@@ -133,7 +133,7 @@ def fit_edge(roi: Array) -> Edge:
     # 3. Fit all parameters.
     limits = np.full((2, PARAMETERS), [[-np.inf], [np.inf]])
     limits[:, BLUR] = _BLUR_LIMITS
-    found = least_squares(
+    solution = least_squares(
         lambda parameters: start.moved(parameters).linearised()[0] - roi.ravel(),
         start.parameters,
         lambda parameters: start.moved(parameters).linearised()[1],
@@ -142,7 +142,7 @@ def fit_edge(roi: Array) -> Edge:
         **dict.fromkeys(("ftol", "xtol", "gtol"), 1e-12),
         max_nfev=100,
     )
-    return start.moved(found.x)
+    return start.moved(solution.x)
 
 
 # --- Checks ---

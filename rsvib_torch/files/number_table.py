@@ -33,8 +33,8 @@ def rows_of_numbers(
             continue
         number = first_line + reader.line_num - 1
         if len(cells) > len(header) and any(cells[len(header) :]):
-            found = f"{len(cells)} values in {len(header)} columns"
-            raise ValueError(f"{path}, line {number}: {found}; write decimal points, not commas")
+            problem = f"{len(cells)} values in {len(header)} columns"
+            raise ValueError(f"{path}, line {number}: {problem}; write decimal points, not commas")
         for column in columns:
             text = cells[column] if column < len(cells) else ""
             try:

@@ -245,5 +245,5 @@ def interpolated_colours(frames: Tensor, colours: Tensor) -> Tensor:
     measured = measures(colours)
     difference = (frames - smoothed(frames, weights)) * measured
     difference = smoothed(difference, weights) / smoothed(measured.to(frames.dtype), weights).expand_as(difference)
-    own = (difference * measured).sum(-3, keepdim=True)
-    return frames - own + difference
+    measured_difference = (difference * measured).sum(-3, keepdim=True)
+    return frames - measured_difference + difference

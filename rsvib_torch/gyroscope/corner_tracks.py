@@ -79,9 +79,9 @@ def followed_pair(first: Grey, second: Grey, masks: tuple[Grey | None, Grey | No
 
     Every frame has its own corners, whose errors are independent of those before.
     """
-    found = find_corners(first, _MOST_CORNERS, mask=masks[0])
-    ends, good = follow_corners(first, second, found)
-    points = np.stack([found, ends], 1)[good]
+    corners = find_corners(first, _MOST_CORNERS, mask=masks[0])
+    ends, good = follow_corners(first, second, corners)
+    points = np.stack([corners, ends], 1)[good]
     if masks[1] is None:
         return points
     x, y = points[:, 1].round().astype(np.int64).T

@@ -54,19 +54,19 @@ def _columns(path: Path, names: list[str]) -> tuple[list[int], set[str]]:
     matches = [(column, match) for column, name in enumerate(names) if (match := _COLUMN_NAME.fullmatch(name))]
     columns, units = list[int](), set[str]()
     for quantity in ("time", "x", "y", "z"):
-        found = [one for one in matches if quantity == ("time" if one[1]["time"] else one[1]["axis"])]
-        if len(found) != 1:
+        of_quantity = [one for one in matches if quantity == ("time" if one[1]["time"] else one[1]["axis"])]
+        if len(of_quantity) != 1:
             what = "time" if quantity == "time" else f"rate about {quantity}"
-            number = "no column" if not found else f"{len(found)} columns"
+            number = "no column" if not of_quantity else f"{len(of_quantity)} columns"
             present = one_line(", ".join(names) or "nothing", 200)
             motion = " (a motion along x and y goes with --unit)" if {"x", "y"} <= {*names} else ""
             raise ValueError(
                 f"{path}: {number} of the {what}; expected one each, with names such as time, gx_rad_s, gy_rad_s, "
                 f"gz_rad_s in the line of names, which has {present}{motion}"
             )
-        columns.append(found[0][0])
+        columns.append(of_quantity[0][0])
         if quantity != "time":
-            units.add((found[0][1]["unit"] or "").replace("dps", "deg")[:3])
+            units.add((of_quantity[0][1]["unit"] or "").replace("dps", "deg")[:3])
     return columns, units
 
 

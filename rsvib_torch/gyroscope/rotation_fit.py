@@ -239,10 +239,10 @@ def _solved(fit: RotationFit, linear: _Linear) -> tuple[RotationFit, Tensor, Ten
     information = linear.weight / linear.variance
     weighted = information[..., None] * linear.effects
     prior = errors.effects.clamp(min=_LEAST_STD) ** -2
-    own = _sums(tracks, weighted.mT @ linear.effects) + torch.diag(prior)  # (P, 6, 6)
+    of_pairs = _sums(tracks, weighted.mT @ linear.effects) + torch.diag(prior)  # (P, 6, 6)
     mixed = _sums(tracks, weighted.mT @ linear.slopes)  # (P, 6, 10)
     of_own = _sums(tracks, (weighted * linear.residual[..., None]).sum(1)) - prior * fit.effects
-    inverse = torch.linalg.inv(own)
+    inverse = torch.linalg.inv(of_pairs)
     gram = torch.einsum("mi,mia,mib->ab", information, linear.slopes, linear.slopes)
     gram = gram - (mixed.mT @ inverse @ mixed).sum(0)
     right = torch.einsum("mi,mi,mia->a", information, linear.residual, linear.slopes)

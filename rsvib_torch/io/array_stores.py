@@ -35,20 +35,20 @@ _h5py = partial(needed_package, "h5py", "reading and writing HDF5", "formats")
 def _find_dataset(file: File) -> Dataset:
     """The only dataset of frames, or the one called ``frames``, among members of the file itself."""
     h5py = _h5py()
-    found: dict[str, Dataset] = {}
+    datasets: dict[str, Dataset] = {}
     members = itertools.count(1)
 
     def visit(name: str, member: Group | Dataset) -> None:
         if next(members) > _MAX_MEMBERS:
             raise ValueError(f"it has more than {_MAX_MEMBERS} members; expected a file with one stack of frames")
         if isinstance(member, h5py.Dataset) and member.ndim in (3, 4) and member.dtype.kind in "iuf":
-            found[name] = member
+            datasets[name] = member
 
     file.visititems(visit)  # every member once, without links
-    if len(found) != 1 and _NAME not in found:
-        names = ", ".join(sorted(found)) or "none"
+    if len(datasets) != 1 and _NAME not in datasets:
+        names = ", ".join(sorted(datasets)) or "none"
         raise ValueError(f"expected one array of frames (T, H, W), or one called {_NAME!r}; found {names}")
-    dataset = found.get(_NAME, next(iter(found.values())))
+    dataset = datasets.get(_NAME, next(iter(datasets.values())))
     if dataset.external or dataset.is_virtual:
         raise ValueError(f"its dataset {dataset.name} lies in other files; frames must be in the file itself")
     return dataset

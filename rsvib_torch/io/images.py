@@ -106,17 +106,17 @@ def _frame_files(path: Path) -> list[Path]:
     """The files of a folder in natural order (frame9 before frame10), or one file."""
     if not path.is_dir():
         return [path]
-    found = _images_in(path)
-    if len(found) > 1:
-        raise ValueError(f"{path}: the folder contains both {' and '.join(found)} files; expected one kind")
-    if not found:
+    images = _images_in(path)
+    if len(images) > 1:
+        raise ValueError(f"{path}: the folder contains both {' and '.join(images)} files; expected one kind")
+    if not images:
         raise ValueError(f"{path}: the folder contains no PNG, TIFF or JPEG files; convert a Zarr store to HDF5")
 
     def parts(file: Path) -> list[tuple[int, int, str]]:
         split = re.split(r"(\d+)", file.name)
         return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in split if part]
 
-    return sorted(next(iter(found.values())), key=parts)
+    return sorted(next(iter(images.values())), key=parts)
 
 
 def _frame_numbers(files: list[Path]) -> tuple[int, ...] | None:
@@ -218,5 +218,5 @@ def check_images(path: Path, info: StackInfo) -> None:
         for kind, files in _images_in(path).items():
             others = {file.name for file in files} - set(_frame_names(info))
             if others:
-                found = f"other {kind} files, e.g. {min(others)}"
-                raise ValueError(f"{path}: the folder contains {found}; choose another folder")
+                problem = f"other {kind} files, e.g. {min(others)}"
+                raise ValueError(f"{path}: the folder contains {problem}; choose another folder")

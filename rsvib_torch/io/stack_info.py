@@ -155,10 +155,10 @@ _RANGE = re.compile(r"(.+)\[(\d*):(\d*)\]")
 
 def split_range(path: Path) -> tuple[Path, tuple[int, int | None] | None]:
     """The file of a stack and the frames ``NAME[START:END]`` that are read of it; None for all of them."""
-    found = _RANGE.fullmatch(path.name)
-    if found is None or path.exists():
+    match = _RANGE.fullmatch(path.name)
+    if match is None or path.exists():
         return path, None
-    name, start, end = found.groups()
+    name, start, end = match.groups()
     return path.with_name(name), (int(start or 0), int(end) if end else None)
 
 

@@ -209,7 +209,7 @@ def _metadata(tif: tifffile.TiffFile) -> dict[str, Tag | None]:
     first = tif.pages.first
     numbers = sorted({1, len(tif.pages) - 1})  # a sample: values differ in all pages or in none
     others = [cast(tifffile.TiffPage, tif.pages.get(number)) for number in numbers if 0 < number < len(tif.pages)]
-    found: dict[str, Tag | None] = {}
+    tags: dict[str, Tag | None] = {}
     for tag in first.tags:
         name = tag.name if not tag.name.isdecimal() else f"tag {tag.name}"
         if tag.code in _RESOLUTION and _value(first, 282) in (None, (1, 1)):
@@ -217,17 +217,17 @@ def _metadata(tif: tifffile.TiffFile) -> dict[str, Tag | None]:
         if tag.code in _COPIED:
             value, *rest = (_value(page, tag.code) for page in (first, *others))
             if any(other not in (None, value) for other in rest):
-                found[f"{name} (differs between pages)"] = None
+                tags[f"{name} (differs between pages)"] = None
             elif value is not None:
                 once = None in rest or tag.code == _DESCRIPTION
-                found[name] = Tag(tag.code, int(tag.dtype), tag.count, value, once, _COPIED[tag.code])
+                tags[name] = Tag(tag.code, int(tag.dtype), tag.count, value, once, _COPIED[tag.code])
             elif tag.code != _DESCRIPTION or tag.value not in ("", first.shaped_description):
-                found[name] = None
+                tags[name] = None
         elif (tag.code >= _FIRST_PRIVATE and tag.code not in _STORAGE) or tag.code == _SUBIFDS:
-            found[name] = None
+            tags[name] = None
     if not _json_description(tif).keys() <= _LAYOUT_KEYS:
-        found["JSON metadata"] = None
-    return found
+        tags["JSON metadata"] = None
+    return tags
 
 
 def _value(page: tifffile.TiffPage, code: int) -> Any:

@@ -110,10 +110,10 @@ def find_cameras(search: str = "") -> tuple[CameraMode, ...]:
     if not isinstance(search, str):
         raise TypeError(f"search must be a text, got {described(search)}")
     words = [_letters(word) for word in search.split()]
-    found = tuple(mode for mode in _modes() if all(word in _letters(mode.name) for word in words))
-    if not found:
+    modes = tuple(mode for mode in _modes() if all(word in _letters(mode.name) for word in words))
+    if not modes:
         raise _unknown(search, ())
-    return found
+    return modes
 
 
 def _unknown(name: str, modes: Sequence[CameraMode]) -> ValueError:
@@ -148,14 +148,14 @@ def camera_mode(name: str, *, width: int, height: int, frame_rate: float) -> Cam
     """
     size = check_whole_number("width", width, at_least=1), check_whole_number("height", height, at_least=1)
     rate = check_number("frame_rate", frame_rate, above=0.0)
-    found = find_cameras(name)
+    similar = find_cameras(name)
     modes = [
         mode
-        for mode in found
+        for mode in similar
         if _letters(name) in {_letters(b + mode.model + v) for b in ("", mode.brand) for v in ("", mode.lens)}
     ]
     if not modes:  # of "iPhone 7", "iPhone 7 Plus" is another camera
-        raise _unknown(name, found)
+        raise _unknown(name, similar)
     sized = [one for one in modes if max(abs(one.width / size[0] - 1), abs(one.height / size[1] - 1)) <= _SAME_SIZE]
     fitting = [mode for mode in sized if math.isclose(mode.frame_rate, rate, rel_tol=_SAME_RATE)]
     if not fitting:

@@ -325,13 +325,13 @@ class ColumnStrips:
         """Images (B, ..., W) from strips (B S, ..., w), or on a finer grid whose first point lies at column 0."""
         last, scale = len(self.firsts) - 1, strips.shape[-1] // self.width
         step = self.middles[1] - self.middles[0] if last else 1.0
-        each = strips.unflatten(0, (-1, last + 1))
-        total = strips.new_zeros(*each[:, 0].shape[:-1], scale * self.frame_width)
+        of_stacks = strips.unflatten(0, (-1, last + 1))
+        total = strips.new_zeros(*of_stacks[:, 0].shape[:-1], scale * self.frame_width)
         place = torch.arange(scale * self.width, device=strips.device)
         for number, (first, middle) in enumerate(zip(self.firsts, self.middles, strict=True)):
             away = (place + scale * (first - middle)) / (scale * step)
             away = away.clamp(min=0.0) if number == 0 else away
             away = away.clamp(max=0.0) if number == last else away
             weight = (1 - away.abs()).clamp(min=0.0).to(strips.dtype)
-            total[..., scale * first : scale * (first + self.width)] += weight * each[:, number]
+            total[..., scale * first : scale * (first + self.width)] += weight * of_stacks[:, number]
         return total

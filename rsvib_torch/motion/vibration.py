@@ -433,7 +433,7 @@ def blind_frequencies(timing: SensorTiming, highest: float) -> Tensor:
     def multiples(interval: float) -> Tensor:
         return torch.arange(1, math.floor(highest * interval) + 1, dtype=torch.float64, device="cpu") / interval
 
-    alike = multiples(float(intervals[0])) if len(intervals) else starts[:0]
-    cycles = alike[:, None] * intervals
-    alike = alike[((cycles - cycles.round()).abs() < 1e-6).all(-1)]  # whole cycles to the rounding of the start times
-    return torch.cat([alike, multiples(timing.exposure_time)]).unique(sorted=True)
+    blind = multiples(float(intervals[0])) if len(intervals) else starts[:0]
+    cycles = blind[:, None] * intervals
+    blind = blind[((cycles - cycles.round()).abs() < 1e-6).all(-1)]  # whole cycles to the rounding of the start times
+    return torch.cat([blind, multiples(timing.exposure_time)]).unique(sorted=True)

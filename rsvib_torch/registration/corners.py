@@ -108,35 +108,35 @@ class CornerFollower:
         small = cv2.resize(grey, (width // scale, height // scale), interpolation=cv2.INTER_AREA)
         around = cv2.blur(small, (_AROUND, _AROUND))
         second = np.asarray(cv2.addWeighted(small, 1.0, around, -1.0, 128.0), np.uint8)
-        starts = np.array([self._start, start])
+        exposed = np.array([self._start, start])
         self._before, self._start = second, start
         self._known, self._votes = _NO_CORNERS
         if before is None:
             return None
-        found = find_corners(before, self._most, known)
-        votes = np.pad(voted, (0, len(found) - len(voted)))
-        ends, good = follow_corners(before, second, found)
-        found, ends, votes = found[good], ends[good], votes[good]
+        starts = find_corners(before, self._most, known)
+        votes = np.pad(voted, (0, len(starts) - len(voted)))
+        ends, good = follow_corners(before, second, starts)
+        starts, ends, votes = starts[good], ends[good], votes[good]
         # 2. Keep those that are at rest if the camera is, else those that follow one affine motion and the vibration of
         # their rows.
-        agree = np.hypot(*(ends - found).T) < _AT_REST
-        if not _stands_still(found, agree, second.shape):
+        agree = np.hypot(*(ends - starts).T) < _AT_REST
+        if not _stands_still(starts, agree, second.shape):
             axis = 1 if timing.scan_axis == -2 else 0
-            agree = _agreeing(found, ends, axis, second.shape[1 - axis], scale)
-            least = min(_MIN_SHARE * len(good), _MIN_FOLLOWED * len(found))
+            agree = _agreeing(starts, ends, axis, second.shape[1 - axis], scale)
+            least = min(_MIN_SHARE * len(good), _MIN_FOLLOWED * len(starts))
             if agree.sum() < max(_MIN_CORNERS, least):
                 return None
-        found, ends, votes = found[agree], ends[agree], votes[agree]
-        layer = _in_layer(found, ends, votes, scale)
+        starts, ends, votes = starts[agree], ends[agree], votes[agree]
+        layer = _in_layer(starts, ends, votes, scale)
         self._known, self._votes = ends, np.where(layer, votes + 1, np.minimum(votes, 0) - 1)
-        blur = blur_products(before, second, found, ends) if self._compare_blur else np.zeros((len(found), 4, 4))
+        blur = blur_products(before, second, starts, ends) if self._compare_blur else np.zeros((len(starts), 4, 4))
         # 3. Their places in the frames, and the times of their rows.
-        found, ends = ((points + 0.5) * scale - 0.5 for points in (found, ends))
-        rows = rows_of_points(np.stack([found, ends], 1), timing, grey.shape)
-        times = starts + rows * timing.row_time + 0.5 * timing.exposure_time
-        places = 0.5 * (found + ends) - 0.5 * (np.array([width, height]) - 1)
+        starts, ends = ((points + 0.5) * scale - 0.5 for points in (starts, ends))
+        rows = rows_of_points(np.stack([starts, ends], 1), timing, grey.shape)
+        times = exposed + rows * timing.row_time + 0.5 * timing.exposure_time
+        places = 0.5 * (starts + ends) - 0.5 * (np.array([width, height]) - 1)
         part = rows[:, 0] / grey.shape[int(timing.scan_axis)]
-        return Corners(np.zeros(len(found), np.int64), part, times, places, ends - found, layer, blur)
+        return Corners(np.zeros(len(starts), np.int64), part, times, places, ends - starts, layer, blur)
 
 
 def rows_of_points(points: Array, timing: SensorTiming, size: tuple[int, ...]) -> Array:
@@ -146,17 +146,17 @@ def rows_of_points(points: Array, timing: SensorTiming, size: tuple[int, ...]) -
     return rows if timing.readout_direction == "forward" else size[1 - axis] - 1 - rows
 
 
-def _agreeing(found: Points, ends: Points, axis: int, length: int, scale: int) -> NDArray[np.bool_]:
+def _agreeing(starts: Points, ends: Points, axis: int, length: int, scale: int) -> NDArray[np.bool_]:
     """(N,) bool, whether corners move with most others of their rows, along ``axis`` of ``length``."""
-    agree = np.zeros(len(found), bool)
-    if len(found) < _MIN_CORNERS:
+    agree = np.zeros(len(starts), bool)
+    if len(starts) < _MIN_CORNERS:
         return agree
     wobble, limit = (max(1.0, limit / scale) for limit in (_WOBBLE, _AGREE))
-    affine, inliers = cv2.estimateAffine2D(found, ends, method=cv2.USAC_MAGSAC, ransacReprojThreshold=wobble)
+    affine, inliers = cv2.estimateAffine2D(starts, ends, method=cv2.USAC_MAGSAC, ransacReprojThreshold=wobble)
     if affine is None:
         return agree
-    inside, rest = inliers[:, 0] > 0, ends - found @ affine[:, :2].T - affine[:, 2]
-    parts = (found[:, axis] * _PARTS / length).astype(np.int64)
+    inside, rest = inliers[:, 0] > 0, ends - starts @ affine[:, :2].T - affine[:, 2]
+    parts = (starts[:, axis] * _PARTS / length).astype(np.int64)
     for number in np.unique(parts[inside]):
         part = inside & (parts == number)
         common = np.median(rest[part], 0) if part.sum() >= _MIN_CORNERS else 0.0
@@ -164,7 +164,7 @@ def _agreeing(found: Points, ends: Points, axis: int, length: int, scale: int) -
     return agree
 
 
-def _in_layer(found: Points, ends: Points, votes: NDArray[np.int64], scale: int) -> NDArray[np.bool_]:
+def _in_layer(starts: Points, ends: Points, votes: NDArray[np.int64], scale: int) -> NDArray[np.bool_]:
     """(N,) bool, whether corners move with the layer that is followed; all of them if there is no layer.
 
     A layer is a part of the scene that moves as one similarity. A vibration moves its rows apart: of several limits,
@@ -174,20 +174,20 @@ def _in_layer(found: Points, ends: Points, votes: NDArray[np.int64], scale: int)
     # 1. The corners that decide: those that moved with the layer last, else those that did not move apart from it. A
     # subject moves with the layer for a moment, and apart from it later.
     least = max(_MIN_CORNERS, _MIN_SHARE * len(votes))
-    decide = next((of for of in (votes > 0, votes >= 0) if of.sum() >= least), np.ones(len(found), bool))
+    decide = next((of for of in (votes > 0, votes >= 0) if of.sum() >= least), np.ones(len(starts), bool))
     # 2. The motion of the layer, and what moves like it.
     for limit in _LAYER_LIMITS / scale:
-        similarity, inside = cv2.estimateAffinePartial2D(found[decide], ends[decide], ransacReprojThreshold=limit)
+        similarity, inside = cv2.estimateAffinePartial2D(starts[decide], ends[decide], ransacReprojThreshold=limit)
         if similarity is not None and inside.mean() > 0.5:
-            rest = ends - found @ similarity[:, :2].T - similarity[:, 2]
+            rest = ends - starts @ similarity[:, :2].T - similarity[:, 2]
             return np.asarray(np.hypot(*rest.T) < 2 * limit)
-    return np.ones(len(found), bool)
+    return np.ones(len(starts), bool)
 
 
-def _stands_still(found: Points, rests: NDArray[np.bool_], shape: tuple[int, ...]) -> bool:
+def _stands_still(starts: Points, rests: NDArray[np.bool_], shape: tuple[int, ...]) -> bool:
     """Whether the camera stands still: most corners rest in the cells at two opposite sides of a frame (H, W)."""
     rows, columns = _grid(*shape)
-    cells = _cells_of(found, shape)
+    cells = _cells_of(starts, shape)
     count, at_rest = (np.bincount(cells, weights, rows * columns).reshape(rows, columns) for weights in (None, rests))
     mostly = at_rest > 0.5 * count
     left, right, top, bottom = (mostly[part].sum() >= _OF_SIDE * (count[part] > 0).sum() > 0 for part in _SIDES)
@@ -268,9 +268,9 @@ def find_corners(grey: Grey, most: int, known: Points = _NO_CORNERS[0], mask: Gr
         top, left = row * height // rows, column * width // columns
         part = slice(top, (row + 1) * height // rows), slice(left, (column + 1) * width // columns)
         inner = None if mask is None else np.ascontiguousarray(mask[part])
-        found = cv2.goodFeaturesToTrack(grey[part], number, _QUALITY, distance, mask=inner)
-        if found is not None:
-            x, y = found[:, 0].T.astype(np.int64) + np.array([[left], [top]])
+        strongest = cv2.goodFeaturesToTrack(grey[part], number, _QUALITY, distance, mask=inner)
+        if strongest is not None:
+            x, y = strongest[:, 0].T.astype(np.int64) + np.array([[left], [top]])
             places = np.stack([x, y], -1)[quality[y, x] > floor].astype(np.float64)
             apart = np.abs(places[:, None] - known).max(-1).min(-1, initial=np.inf) >= distance
             corners.append(places[apart][: number - filled[row, column]])
@@ -294,7 +294,7 @@ def follow_corners(first: Grey, second: Grey, corners: Points) -> tuple[Points, 
     return end[:, 0].astype(np.float64), good
 
 
-def blur_products(first: Grey, second: Grey, found: Array, ends: Array) -> Array:
+def blur_products(first: Grey, second: Grey, starts: Array, ends: Array) -> Array:
     """(N, 4, 4) products of patches around corners (N, 2) of two frames (H, W), for a fit of their blur.
 
     They are those of half of the second derivatives along x, of the mixed ones, of half of those along y, and of the
@@ -311,7 +311,7 @@ def blur_products(first: Grey, second: Grey, found: Array, ends: Array) -> Array
         values = cv2.remap(smooth, at_x, at_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101)
         return np.asarray(values, np.float32).reshape(shape)
 
-    before, after = patches(first, found), patches(second, ends)
+    before, after = patches(first, starts), patches(second, ends)
     mean, here = 0.5 * (before + after), np.s_[:, 1:-1, 1:-1]
     middle = mean[here]
     left, right, above, below = mean[:, 1:-1, :-2], mean[:, 1:-1, 2:], mean[:, :-2, 1:-1], mean[:, 2:, 1:-1]

@@ -254,8 +254,8 @@ def column_pattern(groups: list[tuple[RowSpectra, Tensor, Tensor, Tensor, Tensor
     strength = pattern.abs().square() * power / (energy / count.clamp(min=1.0)).clamp(min=1e-30)
     strength = functional.avg_pool1d(functional.pad(strength[:, None], (8, 8), mode="replicate"), 17, 1)[:, 0]
     share = torch.where(strength > 3.0, 1 - 1 / strength.clamp(min=1.0), 0.0)
-    found: Tensor = pattern * share
+    significant: Tensor = pattern * share
     u = groups[0][0].frequencies.to(power.dtype)
     scene = torch.stack([squared_modulus(spectra.values[:, :, ::16]).mean((1, 2)) for spectra, *_ in groups]).mean(0)
-    slopes, of_scene = ((u.square() * values).sum(-1) for values in (squared_modulus(found), scene))
-    return found * (slopes > _LEAST_PATTERN * of_scene)[:, None]
+    slopes, of_scene = ((u.square() * values).sum(-1) for values in (squared_modulus(significant), scene))
+    return significant * (slopes > _LEAST_PATTERN * of_scene)[:, None]

@@ -232,14 +232,14 @@ def windows_figure(
     for axis, name in enumerate("xy"):
         for panel, (quantity, unit) in zip(panels[:, axis], (("amplitude", "px"), ("frequency", "Hz")), strict=True):
             reliable_values: list[float] = []
-            for time, found in zip(times, detections, strict=True):
-                if found is None:
+            for time, result in zip(times, detections, strict=True):
+                if result is None:
                     panel.axvline(time, color=_GREY, linewidth=0.8, linestyle=":", zorder=0)
                     continue
-                reliable = bool(found.reliable[axis])
-                for tone in found.vibration.amplitude[axis].nonzero()[:, 0].tolist():
-                    value = float(getattr(found.vibration, quantity)[axis, tone])
-                    std, colour = getattr(found.std, quantity)[axis, tone], _AXIS_COLOURS[name] if tone == 0 else _GREY
+                reliable = bool(result.reliable[axis])
+                for tone in result.vibration.amplitude[axis].nonzero()[:, 0].tolist():
+                    value = float(getattr(result.vibration, quantity)[axis, tone])
+                    std, colour = getattr(result.std, quantity)[axis, tone], _AXIS_COLOURS[name] if tone == 0 else _GREY
                     error = 2 * float(std) if reliable and math.isfinite(float(std)) else 0.0
                     style = {"color": colour, "marker": "o", "markerfacecolor": colour if reliable else "white"}
                     panel.errorbar(time, value, error, linestyle="none", markersize=5, capsize=2, **style)

@@ -262,7 +262,7 @@ def solve_scenes(model: FrameModel, scenes: Scenes, options: ExactOptions) -> tu
     """Images (N, C, S H, S W) of scenes, and, on the finer grid, the differences of the frames of each scene."""
     width = model.images.shape[-1]
     blocks = _blocks(model, scenes)
-    found: dict[int, Tensor] = {}
+    images: dict[int, Tensor] = {}
     differences: list[FrameDifference] = []
     advance = steps(len(scenes.stack), "frames")
 
@@ -276,7 +276,7 @@ def solve_scenes(model: FrameModel, scenes: Scenes, options: ExactOptions) -> tu
         else:
             deviations, difference = finer_scene(problem, width, model.motion.neglected)
             differences.append(difference)
-        found.update(zip(numbers, deviations[..., : model.scale * width] + model.mean[some.stack[:, 0]], strict=True))
+        images.update(zip(numbers, deviations[..., : model.scale * width] + model.mean[some.stack[:, 0]], strict=True))
         advance(len(numbers))
 
     if torch.is_grad_enabled() and (model.images.requires_grad or model.motion.exposures[0].requires_grad):
@@ -284,7 +284,7 @@ def solve_scenes(model: FrameModel, scenes: Scenes, options: ExactOptions) -> tu
             solve(block)
     else:
         in_parallel(solve, blocks, model.images.device, at_most=MOST_THREADS)
-    return torch.stack([found[number] for number in range(len(scenes.stack))]), differences
+    return torch.stack([images[number] for number in range(len(scenes.stack))]), differences
 
 
 def _blocks(model: FrameModel, scenes: Scenes) -> list[tuple[str, list[int]]]:

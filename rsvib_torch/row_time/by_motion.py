@@ -69,7 +69,7 @@ def calibrate_row_time_by_motion(frames: FramesOrFiles, options: RowTimeOptions)
     and the row time is fitted together with all parameters of the tones.
 
     The result is reliable only if a single row time within the given limits, and a single readout direction, explains
-    the frames. Other row times that explain them are listed in ``candidates``.
+    the frames. Other row times that explain them are listed in ``agreeing``.
 
     Args:
         frames: Stack (T, H, W) or (T, C, H, W) of three or more consecutive frames, as in ``detect_vibration``.
@@ -109,20 +109,20 @@ def calibrate_row_time_by_motion(frames: FramesOrFiles, options: RowTimeOptions)
     signs = {None: (1.0, -1.0), "forward": (1.0,), "reverse": (-1.0,)}[options.readout_direction]
     clock = CameraClock(period, low, high, signs, exposure or 0.0)
     # 1. The row times that agree with the tones, and the reasons against them.
-    found, reasons = list[Candidate](), [Reason("too_few_frames_for_row_time", None, num_frames, _MIN_FRAMES)]
+    agreeing, reasons = list[Candidate](), [Reason("too_few_frames_for_row_time", None, num_frames, _MIN_FRAMES)]
     if num_frames >= _MIN_FRAMES:
         with threads_for(stack.images):
-            found, reasons = row_times_of_tones(stack, clock, options)
-        reasons += [] if found else [Reason("no_motion_for_row_time")]
-    if len(found) > 1:
-        listed = ", ".join(f"{1e6 * one.row_time:.4f}" for one in found[1:9])
-        details: dict[str, float | str] = {"row_time": 1e6 * found[0].row_time, "others": listed}
-        reasons.append(Reason("row_times_ambiguous", None, len(found), 1, details))
-    row_time, std = (abs(found[0].row_time), found[0].std) if found else (None, None)
+            agreeing, reasons = row_times_of_tones(stack, clock, options)
+        reasons += [] if agreeing else [Reason("no_motion_for_row_time")]
+    if len(agreeing) > 1:
+        listed = ", ".join(f"{1e6 * one.row_time:.4f}" for one in agreeing[1:9])
+        details: dict[str, float | str] = {"row_time": 1e6 * agreeing[0].row_time, "others": listed}
+        reasons.append(Reason("row_times_ambiguous", None, len(agreeing), 1, details))
+    row_time, std = (abs(agreeing[0].row_time), agreeing[0].std) if agreeing else (None, None)
     if row_time is not None and std is not None and std > _MAX_STD * row_time:
         reasons.append(Reason("row_time_uncertain", None, std / row_time, _MAX_STD))
     # 2. The result; the readout direction if all of them have the same.
-    directions: set[Literal["forward", "reverse"]] = {"forward" if one.row_time > 0 else "reverse" for one in found}
+    directions: set[Literal["forward", "reverse"]] = {"forward" if one.row_time > 0 else "reverse" for one in agreeing}
     notes = (
         f"row times of {1e6 * low:.3f} to {1e6 * high:.3f} us were considered, a readout within a tenth to the "
         "whole of the frame period; pass row_time=(low, high) for other ones",
@@ -133,7 +133,7 @@ def calibrate_row_time_by_motion(frames: FramesOrFiles, options: RowTimeOptions)
         frame_rows=None if row_time is None else period / row_time,
         readout_direction=directions.pop() if len(directions) == 1 else None,
         notes=notes if options.row_time is None else (),
-        candidates=tuple(sorted(one.row_time for one in found)),
+        candidates=tuple(sorted(one.row_time for one in agreeing)),
         reliable=not reasons,
         findings=reasons_from_row_order(tuple(reasons), sensor),
     )

@@ -131,7 +131,7 @@ def _fitted(rows: _MeasuredRows, axis: int, start: Array) -> _Tones:
     """Weighted least squares from start parameters (4 K + 1,)."""
     measured = rows.measurements.displacements[..., axis]
     root = np.sqrt(rows.measurements.inverse_variances[..., axis])[..., None]
-    found = least_squares(
+    solution = least_squares(
         lambda values: (root * (rows.model(values)[0] - measured)).ravel(),
         start,
         lambda values: (root[..., None] * rows.model(values)[1]).reshape(-1, len(values)),
@@ -140,8 +140,8 @@ def _fitted(rows: _MeasuredRows, axis: int, start: Array) -> _Tones:
         max_nfev=80,
     )
     spare = max(1.0, float(rows.measurements.num_measurements[0, axis]) - len(start))
-    covariance = scaled_inverse(found.jac.T @ found.jac) * (2 * found.cost / spare)
-    return _Tones(found.x, covariance, (measured - rows.model(found.x)[0])[0], 2 * found.cost)
+    covariance = scaled_inverse(solution.jac.T @ solution.jac) * (2 * solution.cost / spare)
+    return _Tones(solution.x, covariance, (measured - rows.model(solution.x)[0])[0], 2 * solution.cost)
 
 
 def _with_tone(rows: _MeasuredRows, axis: int, tones: _Tones, nu: float, phi: float) -> _Tones:
@@ -176,20 +176,20 @@ def _found(rows: _MeasuredRows, axis: int, highest: float, share: float, known: 
 
     A further tone must explain a ``share`` of the residual.
     """
-    found = _fitted(rows, axis, known)
-    while len(found.tones) < MAX_TONES:
-        tried = [_with_tone(rows, axis, found, *peak) for peak in _peaks(rows, axis, found.residual, highest, 4)]
+    best = _fitted(rows, axis, known)
+    while len(best.tones) < MAX_TONES:
+        tried = [_with_tone(rows, axis, best, *peak) for peak in _peaks(rows, axis, best.residual, highest, 4)]
         # nearly blind tones have arbitrary amplitudes, and explain nothing that others do not
         tried = [fit for fit in tried if np.all(2 * np.abs(np.sin(math.pi * fit.tones[:, 3])) > MIN_GAIN)]
         if not tried:
             break
         trial = min(tried, key=lambda fit: fit.cost)
         spare = float(rows.measurements.num_measurements[0, axis]) - len(trial.values)
-        needed = max(F_THRESHOLD * 4 * trial.cost / max(spare, 1.0), share * found.cost)
-        if spare < len(trial.values) or found.cost - trial.cost <= needed:
+        needed = max(F_THRESHOLD * 4 * trial.cost / max(spare, 1.0), share * best.cost)
+        if spare < len(trial.values) or best.cost - trial.cost <= needed:
             break
-        found = trial
-    return found
+        best = trial
+    return best
 
 
 def _motion(tones: list[_Tones], timing: RowTiming, num_frames: int, num_rows: int) -> Vibration:
@@ -240,12 +240,12 @@ def candidates(tones: list[_Tones], clock: CameraClock) -> list[Candidate]:
     stds = np.abs(row_times / inverse) / np.sqrt(by_nu @ nu)
 
     # 3. Different ones that are possible.
-    found: list[Candidate] = []
+    possible: list[Candidate] = []
     for one in map(Candidate, row_times.tolist(), stds.tolist(), chi_square.tolist()):
-        known = any(abs(one.row_time - other.row_time) < 1e-3 * one.std + 1e-9 * clock.high for other in found)
+        known = any(abs(one.row_time - other.row_time) < 1e-3 * one.std + 1e-9 * clock.high for other in possible)
         if clock.allows(one.row_time) and not known:
-            found.append(one)
-    return sorted(found, key=lambda candidate: candidate.chi_square)
+            possible.append(one)
+    return sorted(possible, key=lambda candidate: candidate.chi_square)
 
 
 def row_times_of_tones(

@@ -85,8 +85,8 @@ def _solve(matrix: Array, right: Array) -> Array:
     """Least squares (T, N) of (T, H, N) and (T, H) by normal equations, with a ridge for collinear columns."""
     gram = matrix.mT @ matrix
     ridge = 1e-11 * np.maximum(np.diagonal(gram, axis1=-2, axis2=-1), _TINY)
-    found: Array = np.linalg.solve(gram + ridge[..., None] * np.eye(gram.shape[-1]), matrix.mT @ right[..., None])
-    return found[..., 0]
+    solution: Array = np.linalg.solve(gram + ridge[..., None] * np.eye(gram.shape[-1]), matrix.mT @ right[..., None])
+    return solution[..., 0]
 
 
 def _unexplained(matrix: Array, values: Array) -> Array:
@@ -102,8 +102,8 @@ def _fit_bands(brightness: Array, start: float, scene: SceneModel) -> BandFit | 
     rough = _fit(brightness, start, scene, 1)
     if rough is None or rough.certainty <= _CERTAIN:
         return None
-    found = _fit(brightness, rough.period, scene, max(1, min(_HARMONICS, int(rough.period / 4))))
-    return found if found is not None and found.certainty > _CERTAIN else None
+    fit = _fit(brightness, rough.period, scene, max(1, min(_HARMONICS, int(rough.period / 4))))
+    return fit if fit is not None and fit.certainty > _CERTAIN else None
 
 
 def _fit(brightness: Array, start: float, scene: SceneModel, count: int) -> BandFit | None:

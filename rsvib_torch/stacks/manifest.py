@@ -117,16 +117,16 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
 
         Tones are medians over the reliable windows, with the standard deviation over the windows.
         """
-        windows, found = self.windows, [record.detection for record in self.windows]
+        windows, detections = self.windows, [record.detection for record in self.windows]
         gains = [record.predicted_gain for record in windows if record.predicted_gain is not None]
-        names = AXIS_NAMES[: max((one.vibration.num_axes for one in found if one is not None), default=2)]
+        names = AXIS_NAMES[: max((one.vibration.num_axes for one in detections if one is not None), default=2)]
         unchanged = [(reason.axis, record.window, reason) for record in windows for reason in record.left_alone]
         return {
             "windows": len(windows),
             "restored": sum(record.frames == "restored" for record in windows),
             "outcomes": dict(Counter(record.outcome for record in windows if record.outcome is not None)),
             "predicted_gain_db": {"lowest": min(gains), "highest": max(gains)} if gains else None,
-            "tones": {name: _tones_over_windows(found, axis) for axis, name in enumerate(names)},
+            "tones": {name: _tones_over_windows(detections, axis) for axis, name in enumerate(names)},
             "left_alone": {
                 name: {str(window): reason.to_dict() for axis, window, reason in unchanged if axis == name}
                 for name in names
@@ -217,13 +217,13 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
 
     def _lines_of_video(self) -> list[str]:
         """Axes of a video that were restored although they are not reliable, and the first assumption."""
-        found = [(record.window, record.detection) for record in self.windows if record.detection is not None]
+        detections = [(record.window, record.detection) for record in self.windows if record.detection is not None]
         lines = []
         for axis, name in enumerate(AXIS_NAMES[:2]):
-            against = {window: [one for one in of.findings[axis] if one.code != "no_tone"] for window, of in found}
+            against = {window: [one for one in of.findings[axis] if one.code != "no_tone"] for window, of in detections}
             why = {window: "; ".join(map(str, of_axis)) for window, of_axis in against.items() if of_axis}
             lines += self._noted(f"{name} restored as measured, but not reliable", why)
-        return lines + [wrapped(f"assumed: {one}") for _, of in found for one in of.assumptions][:1]
+        return lines + [wrapped(f"assumed: {one}") for _, of in detections for one in of.assumptions][:1]
 
     @property
     def is_removed(self) -> bool:
@@ -242,25 +242,25 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
         ]
 
 
-def _gyroscope_lines(found: Table) -> list[str]:
+def _gyroscope_lines(alignment: Table) -> list[str]:
     """Axes, clock and focal length by the gyroscope of a video."""
-    axes = ", ".join(letter.lower() if letter.isupper() else f"-{letter}" for letter in found["orientation"])
+    axes = ", ".join(letter.lower() if letter.isupper() else f"-{letter}" for letter in alignment["orientation"])
     return [
         f"rotation by the gyroscope, whose axes {axes} are x, y, z of the camera",
-        f"time 0 of the frames is {measured_text(found['offset'], found['offset_std'])} s of the gyroscope",
-        f"focal length {measured_text(found['focal_length'], found['focal_length_std'])} px",
+        f"time 0 of the frames is {measured_text(alignment['offset'], alignment['offset_std'])} s of the gyroscope",
+        f"focal length {measured_text(alignment['focal_length'], alignment['focal_length_std'])} px",
     ]
 
 
 _SAME_TONE = 0.03  # of the frequency, or 4 std: a tone of the next window closer than this is the same one
 
 
-def _tones_over_windows(found: Sequence[DetectedVibration | None], axis: int) -> Table:
+def _tones_over_windows(detected: Sequence[DetectedVibration | None], axis: int) -> Table:
     """Number of windows in which an axis is reliable, and median and spread of its tones over them, strongest first.
 
     The tones of a window, the strongest first, continue those of nearly the same frequency in the windows before.
     """
-    reliable = [one for one in found if one is not None and axis < one.vibration.num_axes and bool(one.reliable[axis])]
+    reliable = [one for one in detected if one is not None and axis < one.vibration.num_axes and one.reliable[axis]]
     tones: list[list[tuple[float, float]]] = []  # (amplitude, frequency) in the windows of each tone
     for one in reliable:
         columns = (one.vibration.amplitude, one.vibration.frequency, one.std.frequency)

@@ -94,9 +94,9 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
         threads = torch.get_num_threads() if all(window.alone for window in missing) else 1
         computed = in_threads(job.compute, read_windows(job, missing), at_once=at_once, threads=threads)
         with closing(computed) as results:
-            for window, (record, frames, found) in zip(missing, results, strict=True):
+            for window, (record, frames, of_first) in zip(missing, results, strict=True):
                 records.append(record)
-                detection = detection or found
+                detection = detection or of_first
                 if len(records) >= min(_MAX_INITIAL_FAILURES, len(windows)) and all(one.error for one in records):
                     folder.remove()
                     raise ValueError(records[0].error)

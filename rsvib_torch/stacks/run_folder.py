@@ -55,8 +55,8 @@ def _difference(old: object, new: object, path: str = "") -> str | None:
     """The first key in which two tables differ, with both values; None if they are equal."""
     if isinstance(old, dict) and isinstance(new, dict):
         keys = dict.fromkeys([*new, *old])
-        found = (_difference(old.get(key), new.get(key), f"{path}.{key}".lstrip(".")) for key in keys)
-        return next(filter(None, found), None)
+        differences = (_difference(old.get(key), new.get(key), f"{path}.{key}".lstrip(".")) for key in keys)
+        return next(filter(None, differences), None)
     texts = (one_line(json.dumps(value), 60) for value in (old, new))
     return None if old == new else "{} was {}, now it is {}".format(path, *texts)
 

@@ -90,9 +90,9 @@ def measured_motion(frames: Tensor, timing: SensorTiming, options: Mapping[str, 
     rows = frames.shape[int(timing.scan_axis)]
     with suppress(ValueError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
         knot_rows = min(24, max(4, rows // _KNOTS))
-        found = detect_motion(frames, timing, channels=channels, knot_rows=knot_rows)
-        if found.reliable.sum() > detected.reliable.sum():
-            return WindowMotion(found, _tones_in_place_of(found, detected), timing, reliable_motion(found)[0])
+        free = detect_motion(frames, timing, channels=channels, knot_rows=knot_rows)
+        if free.reliable.sum() > detected.reliable.sum():
+            return WindowMotion(free, _tones_in_place_of(free, detected), timing, reliable_motion(free)[0])
     return WindowMotion(detected, detected, timing)
 
 
@@ -106,21 +106,21 @@ def may_change(detection: DetectedVibration, num_frames: int) -> bool:
     return num_frames >= _LEAST_FRAMES and not is_other_timing and not _CHANGES.isdisjoint(codes)
 
 
-def reliable_motion(found: MotionDetection) -> tuple[FreeMotion, tuple[Reason, ...]]:
+def reliable_motion(detection: MotionDetection) -> tuple[FreeMotion, tuple[Reason, ...]]:
     """A motion of any shape without the axes that are not reliable, and a reason for each of these."""
-    motion, factor = found.motion, found.reliable.to(found.motion.coefficients)
+    motion, factor = detection.motion, detection.reliable.to(detection.motion.coefficients)
     kept = FreeMotion(
         motion.coefficients * factor[:, None], motion.start, motion.spacing, motion.tones.scaled(factor), motion.camera
     )
     refused = [
         Reason("axis_not_reliable", name, details={"action": "restored", "why": "; ".join(reasons)})
-        for name, reasons in zip(AXIS_NAMES, found.reasons, strict=False)
+        for name, reasons in zip(AXIS_NAMES, detection.reasons, strict=False)
         if reasons
     ]
     return kept, tuple(refused)
 
 
-def _tones_in_place_of(found: MotionDetection, refused: DetectedVibration) -> DetectedVibration:
+def _tones_in_place_of(free: MotionDetection, refused: DetectedVibration) -> DetectedVibration:
     """A tone for each axis of a detected motion, to draw it and list it beside the tones of other windows.
 
     The standard deviation of the frequency is half of the resolution of the record. The reasons against the ``refused``
@@ -130,9 +130,9 @@ def _tones_in_place_of(found: MotionDetection, refused: DetectedVibration) -> De
     assumed = tuple(
         f"the vibration changes; tones along {name} are refused: {one}" for name, of in against for one in of
     )
-    first, last = float(found.times.min()), float(found.times.max())
-    displacement = found.std.square().mean((0, 1)).sqrt()
-    vibration = vibration_in_place_of(found.motion, first, last)
+    first, last = float(free.times.min()), float(free.times.max())
+    displacement = free.std.square().mean((0, 1)).sqrt()
+    vibration = vibration_in_place_of(free.motion, first, last)
     unknown = torch.full_like(vibration.amplitude, math.inf)
     by_frequency = torch.full_like(vibration.amplitude, 0.5 / (last - first))
     std = VibrationStd(
@@ -144,8 +144,8 @@ def _tones_in_place_of(found: MotionDetection, refused: DetectedVibration) -> De
         image_acceleration=unknown[:, 0],
         displacement=displacement,
     )
-    gain = vibration.gain(float(found.times[:, 0].diff().mean()))
-    return DetectedVibration(vibration, std, gain, found.unexplained, found.reliable, found.findings, assumed)
+    gain = vibration.gain(float(free.times[:, 0].diff().mean()))
+    return DetectedVibration(vibration, std, gain, free.unexplained, free.reliable, free.findings, assumed)
 
 
 # --- Restoration and verdict ---

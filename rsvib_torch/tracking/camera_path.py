@@ -54,11 +54,11 @@ class CameraPath:
         """Tones that displace the rows, around a time in s, which is the origin of their phases."""
         weights = self._weights(np.array([time]))[:, 0]
         return [
-            replace(found, frequency=window.part * found.frequency)
+            replace(at_time, frequency=window.part * at_time.frequency)
             for weight, window in zip(weights, self.windows, strict=True)
             if weight > 0 and window.part > 0
             for tone in window.tones
-            for found in [tone.at(time - window.origin, time - window.origin, float(weight))]
+            for at_time in [tone.at(time - window.origin, time - window.origin, float(weight))]
         ]
 
     def nearest(self, time: float) -> WindowPath:
@@ -81,32 +81,32 @@ def camera_path(
     def fit() -> None:
         known = [pair for pair in waiting if pair is not None]
         if len(known) >= max(2, len(waiting) // 4):
-            found = fit_window(Corners.joined(known), timing.frame_period, averaged, readout, has_tones)
+            result = fit_window(Corners.joined(known), timing.frame_period, averaged, readout, has_tones)
             # waves without tones are not searched for again (a third of the time) where no readout explained a window
             is_tried = any(one.residual > allowed and one.other_readout is None for one in windows)
             limit = math.inf if is_tried else allowed
-            window = compared_readouts(found, timing, size, limit) if has_tones else found.path()
+            window = compared_readouts(result, timing, size, limit) if has_tones else result.path()
             windows.extend(swept(window) or [window])
 
     def swept(window: WindowPath) -> list[WindowPath]:
         """Short windows with tones that sweep, from the windows before on, if they explain the corners."""
-        found: list[WindowPath] = []
+        short: list[WindowPath] = []
         # behind a tone that sweeps, three steady ones may explain the last frames as well
         continued = bool(windows) and any(tone.slope for tone in windows[-1].tones)
         if not has_tones or (window.residual < allowed and not continued):
-            return found
+            return short
         least = (1.2 if continued else 0.5) * window.residual
         if window.other_readout is not None:  # tones that sweep explain less than the other readout does
             least = min(least, window.other_readout[2])
         firsts = range(0, len(waiting) - _SHORT_FRAMES // 2, _SHORT_FRAMES // 2)
         for first in firsts:
             known = [pair for pair in waiting[first : first + _SHORT_FRAMES] if pair is not None]
-            if len(known) < _SHORT_FRAMES // 2 or 2 * sum(one.residual >= least for one in found) > len(firsts):
+            if len(known) < _SHORT_FRAMES // 2 or 2 * sum(one.residual >= least for one in short) > len(firsts):
                 return []  # the median of all will not be less
             joined = Corners.joined(known)
             if not windows or joined.times.mean() > windows[-1].origin:
-                found.append(fit_window(joined, timing.frame_period, averaged, readout, slopes=_SLOPES).path())
-        return found if found and np.median([one.residual for one in found]) < least else []
+                short.append(fit_window(joined, timing.frame_period, averaged, readout, slopes=_SLOPES).path())
+        return short if short and np.median([one.residual for one in short]) < least else []
 
     fitted = 0
     for pair in pairs:

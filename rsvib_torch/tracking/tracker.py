@@ -412,13 +412,13 @@ class VibrationTracker:
         only_bands = state.attempts > _DIRECT_ATTEMPTS and height >= _FEW_ROWS
         started = state
         for method, number in _STARTS[:1] if only_bands else _STARTS:
-            found = attempt(stacks, timing, DetectionOptions(method, number, drift_order, _BANDS), hypothesis)
-            if scene_reasons(found.start.curve, stacks.images.shape[-1])[0] or not found.visible[0]:
+            result = attempt(stacks, timing, DetectionOptions(method, number, drift_order, _BANDS), hypothesis)
+            if scene_reasons(result.start.curve, stacks.images.shape[-1])[0] or not result.visible[0]:
                 break
             # Tones that the last frame contradicts are not used: without tones, the path is followed at least.
-            plausible = _plausible(found)
+            plausible = _plausible(result)
             for chosen in (plausible, torch.zeros_like(plausible)):
-                started = self._started(started, found, chosen, middle, times[-1] - times[0])
+                started = self._started(started, result, chosen, middle, times[-1] - times[0])
                 if started.track is not None:
                     break
             if started.track is not None and started.contradictions == 0:
@@ -441,12 +441,12 @@ class VibrationTracker:
         stacks = GreyFrames(without_mosaic(images), mask, batched=False, timing=self._rows)
         return stacks if self.options.columns is None else stacks.narrowed(self.options.columns)
 
-    def _started(self, state: _State, found: Attempt, chosen: Tensor, middle: float, record: float) -> _State:
+    def _started(self, state: _State, result: Attempt, chosen: Tensor, middle: float, record: float) -> _State:
         """Start the filter with the ``chosen`` (2, K) tones of a detection from the last frames; measure the last one.
 
         The ``middle`` of these frames is the time origin of the detection, the ``record`` their duration (s).
         """
-        vibration, std, curve = found.vibration[0], found.std_if_hidden_tone[0], found.fitted.offsets[0].to("cpu")
+        vibration, std, curve = result.vibration[0], result.std_if_hidden_tone[0], result.fitted.offsets[0].to("cpu")
         # 1. Image motion. A record does not distinguish a tone of less than one period from a drift, and its amplitude
         # is not known: it becomes a part of the drift. Without tones, the drift of the fit is wrong as well.
         tones = torch.polar(vibration.amplitude, vibration.phase - 0.5 * math.pi) * chosen
@@ -511,15 +511,16 @@ class VibrationTracker:
         )
 
 
-def _plausible(found: Attempt) -> Tensor:
+def _plausible(result: Attempt) -> Tensor:
     """(2, K) bool, tones to start with: significant ones, and the strongest of each axis above its standard deviation.
 
     The verdict on a record may be that the motion changes, which the filter follows. It has its own verdict.
     """
-    vibration, amplitude, std = found.vibration[0], found.vibration[0].amplitude, found.std_if_hidden_tone[0].amplitude
+    vibration, std = result.vibration[0], result.std_if_hidden_tone[0].amplitude
+    amplitude = vibration.amplitude
     strongest = amplitude == amplitude.amax(-1, keepdim=True)
     plausible = (amplitude > MIN_SIGNIFICANCE * std) | (strongest & (amplitude > std))
-    return plausible & (vibration.gain(found.interval).abs() > MIN_GAIN)  # blind tones may have any amplitude
+    return plausible & (vibration.gain(result.interval).abs() > MIN_GAIN)  # blind tones may have any amplitude
 
 
 def _of_present_tones(reasons: tuple[Reason, ...], tones: int) -> tuple[Reason, ...]:

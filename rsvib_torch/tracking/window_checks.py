@@ -69,11 +69,11 @@ def _strongest_wave(fit: WindowFit, axis: int, readout: float) -> _Wave | None:
 
     def best(searched: Array, wanted: NDArray[np.bool_], parts: Array) -> list[tuple[float, float, float, float]]:
         """Sum of squares that a wave explains, its frequencies, and its ratio, for parts of the frame rate."""
-        found = []
+        explained = []
         for part in parts:
             wave, ratio, offsets = rest.strongest(axis, searched, wanted, turns=part * rate * readout)
-            found.append((offsets**2, wave, wave + part * rate, ratio))
-        return found
+            explained.append((offsets**2, wave, wave + part * rate, ratio))
+        return explained
 
     # 1. Its frequency from frame to frame is that of the strongest tone, or of the strongest of all waves.
     tones = [tone for tone in fit.tones if tone.axis == axis]
@@ -87,9 +87,9 @@ def _strongest_wave(fit: WindowFit, axis: int, readout: float) -> _Wave | None:
             return None
     # 2. What it explains is a parabola over its frequency within a frame, around the highest value.
     near = frequency + (grid[1] - grid[0]) * np.arange(-3, 4)
-    found = best(near, np.ones(len(near), bool), part + _FINE)
-    number = min(max(int(np.argmax([squares for squares, *_ in found])), 1), len(found) - 2)
-    before, top, after = (squares for squares, *_ in found[number - 1 : number + 2])
+    explained = best(near, np.ones(len(near), bool), part + _FINE)
+    number = min(max(int(np.argmax([squares for squares, *_ in explained])), 1), len(explained) - 2)
+    before, top, after = (squares for squares, *_ in explained[number - 1 : number + 2])
     shift = 0.5 * (after - before) / max(2.0 * top - after - before, 1e-30)
     step = (_FINE[1] - _FINE[0]) * rate
     return _Wave(axis, frequency, frequency + (part + _FINE[number]) * rate + step * float(np.clip(shift, -1.0, 1.0)))
@@ -186,10 +186,10 @@ def compared_readouts(fit: WindowFit, timing: SensorTiming, size: tuple[int, int
         return replace(fit.path(), blur=blur, agreeing=of_agreeing)
     # 3. Frames whose columns are read one after another are moved as a whole.
     most = _CONTRADICTED * left[of, part]
-    alike = sorted((value, one) for (its, one), value in left.items() if its is of is rows and value < most)
-    names = " or ".join([*dict.fromkeys(name(one) for _, one in alike)][:3]) or "column by column"
-    found = names, math.sqrt(fit.unexplained), math.sqrt(other.unexplained)
-    return replace(other.path(), other_readout=found, part=part if of is rows else 0.0)
+    as_good = sorted((value, one) for (its, one), value in left.items() if its is of is rows and value < most)
+    names = " or ".join([*dict.fromkeys(name(one) for _, one in as_good)][:3]) or "column by column"
+    other_readout = names, math.sqrt(fit.unexplained), math.sqrt(other.unexplained)
+    return replace(other.path(), other_readout=other_readout, part=part if of is rows else 0.0)
 
 
 def blur_ratio(fit: WindowFit, timing: SensorTiming, size: tuple[int, int]) -> tuple[float, float]:

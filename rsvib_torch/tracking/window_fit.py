@@ -483,19 +483,19 @@ def fit_window(
     limits = frequencies[is_visible][[0, -1]] if is_visible.any() else np.zeros(2)  # Hz
     axes = [0, 1] if has_tones and is_visible.sum() > 2 else []
     # Strongest tones by axis and slope. A tone of one axis does not change those of the other.
-    found: dict[tuple[int, float], tuple[float, float, float]] = {}
+    peaks: dict[tuple[int, float], tuple[float, float, float]] = {}
     left_out = np.zeros((2, len(frequencies)), bool)
     while axes:
         for axis, slope in ((axis, float(slope)) for axis in axes for slope in slopes):
-            if (axis, slope) not in found:
+            if (axis, slope) not in peaks:
                 wanted = is_resolved if abs(slope) > _FAST else is_visible
                 wanted = wanted & fit.is_apart(axis, frequencies) & ~left_out[axis]
-                found[axis, slope] = fit.strongest(axis, frequencies, wanted, slope=slope)
-        (axis, slope), (frequency, ratio, offsets) = max(found.items(), key=lambda item: item[1][1])
+                peaks[axis, slope] = fit.strongest(axis, frequencies, wanted, slope=slope)
+        (axis, slope), (frequency, ratio, offsets) = max(peaks.items(), key=lambda item: item[1][1])
         if ratio < MIN_RATIO or offsets < _MIN_EXPLAINED:
             break
         best, *_ = fit.with_aliases(axis, frequency, slope, limits)
-        found = {of: value for of, value in found.items() if of[0] != axis}
+        peaks = {of: value for of, value in peaks.items() if of[0] != axis}
         best.solve()
         if any(_gain(tone.frequency, interval) < _MIN_GAIN for tone in best.tones if abs(tone.slope) <= _FAST):
             # It has been corrected to a frequency that frames do not show. A part of the picture that moves by itself

@@ -34,11 +34,11 @@ class RecordedRotation:
     orientations: Rotation  # (N) of the camera at these times, from the first
 
     @classmethod
-    def aligned(cls, rates: AngularRates, found: RotationAlignment, times: Array) -> "RecordedRotation":
+    def aligned(cls, rates: AngularRates, alignment: RotationAlignment, times: Array) -> "RecordedRotation":
         """The rotation at the middles of all frames, which the recording must cover, by rates aligned with some."""
         # 1. The rates about the axes of the camera, per second of the frames.
-        turned = found.scale * (rates.rates.cpu() - found.bias) @ orientation_matrix(found.orientation).T
-        of_camera = AngularRates((rates.times.cpu() - found.offset) / found.scale, turned)
+        turned = alignment.scale * (rates.rates.cpu() - alignment.bias) @ orientation_matrix(alignment.orientation).T
+        of_camera = AngularRates((rates.times.cpu() - alignment.offset) / alignment.scale, turned)
         if times[0] < of_camera.start or times[-1] > of_camera.end:
             raise ValueError(
                 f"the gyroscope was recorded from {of_camera.start:.4g} to {of_camera.end:.4g} s of the video: it must "
@@ -49,7 +49,7 @@ class RecordedRotation:
         before = torch.searchsorted(of_camera.times, middles, right=True) - 1
         samples = Rotation.from_rotvec(table(of_camera.attitude(float(times[0]))[before]))
         rest = Rotation.from_rotvec(table(of_camera.rotation(of_camera.times[before], middles)))
-        return cls(of_camera, found.motion.camera or Camera(found.focal_length), times, samples * rest)
+        return cls(of_camera, alignment.motion.camera or Camera(alignment.focal_length), times, samples * rest)
 
     @cached_property
     def _axes(self) -> Rotation:

@@ -249,40 +249,40 @@ def video_motion(
 
     With the ``rates`` of a gyroscope, its rotation is the path; the focal length is that of the ``camera``, or fitted.
     """
-    found, timing = FirstPass(frames, for_gyroscope=rates is not None), frames.job.timing
+    first_pass, timing = FirstPass(frames, for_gyroscope=rates is not None), frames.job.timing
 
     def to_steady(path: Array, of_frames: Callable[[Array], Array] = np.asarray) -> Array:
         return steady_shifts(frames.middles, path, options.steady, frames.size, options.crop_limit, of_frames)
 
     if rates is None:
         with ONE_BLAS_THREAD:
-            path = camera_path(found.pairs(progress), timing, frames.size, has_tones=not frames.stabilised)
-        places = path.places(found.taken)
-        _check_repetitions(found.repetitions, places[:, :2])
+            path = camera_path(first_pass.pairs(progress), timing, frames.size, has_tones=not frames.stabilised)
+        places = path.places(first_pass.taken)
+        _check_repetitions(first_pass.repetitions, places[:, :2])
         shift = to_steady(places)
-        polynomials = np.stack([path.derivatives(found.taken, 1), path.derivatives(found.taken, 2), shift], 1)
+        polynomials = np.stack([path.derivatives(first_pass.taken, 1), path.derivatives(first_pass.taken, 2), shift], 1)
         polynomials[:, :2] *= not frames.stabilised
 
         def by_corners(index: int) -> Vibration:
             """The tones, skew and wobble by the path, and what the path is not smooth by."""
-            tones, polynomial = path.tones(float(found.taken[index])), polynomials[index]
+            tones, polynomial = path.tones(float(first_pass.taken[index])), polynomials[index]
             if options.steady == 0:  # axes without vibration stay as taken
                 polynomial = polynomial * np.array([any(tone.axis == axis for tone in tones) for axis in range(4)])
             amplitude, frequency, phase, *_ = tone_tables(tones, 4)
             return Vibration(amplitude, frequency, phase, *polynomial)
 
-        return VideoMotion(frames, path, found, by_corners, options.steady > 0)
-    deque(found.pairs(progress), maxlen=0)  # all frames are followed, for ``found.compared`` and ``found.corners``
-    tracks = tracks_of_pairs(found.compared, frames.starts.tolist(), timing, frames.size)
+        return VideoMotion(frames, path, first_pass, by_corners, options.steady > 0)
+    deque(first_pass.pairs(progress), maxlen=0)  # all frames are followed, for ``found.compared`` and ``found.corners``
+    tracks = tracks_of_pairs(first_pass.compared, frames.starts.tolist(), timing, frames.size)
     aligned = align_rates(tracks, timing, rates, AlignOptions(camera=camera))
     if not aligned.reliable:
         reasons = "; ".join(aligned.reasons)
         raise ValueError(f"the gyroscope ({rates.source}) does not fit the video: {reasons}")
-    rotation = RecordedRotation.aligned(rates, aligned, found.taken)
+    rotation = RecordedRotation.aligned(rates, aligned, first_pass.taken)
     turned = to_steady(rotation.path, rotation.of_frames)
     half = timing.time_to_middle(frames.size[int(timing.scan_axis)])
     return VideoMotion(
-        frames, aligned, found, lambda index: rotation.motion(index, turned[index], half), options.steady > 0
+        frames, aligned, first_pass, lambda index: rotation.motion(index, turned[index], half), options.steady > 0
     )
 
 

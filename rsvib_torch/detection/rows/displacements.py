@@ -344,7 +344,7 @@ def _rms_of_contrasts(
     also scatters the mean, of which two standard deviations are subtracted: of 48 axes of pairs of 192 rows with noise
     of 0.025, 11 seemed to roll.
     """
-    found = []
+    of_groups = []
     for of_group in gradients:
         residual, noise, regular = displacements_of_parts(of_group, len(weights[0]))
         contrasts = residual.new_tensor(weights)
@@ -354,8 +354,8 @@ def _rms_of_contrasts(
         excess = (moved.square() - variance).sum(2)
         both = torch.cat([excess, 2 * variance.square().sum(2)], -1)  # and the variance of the excess
         both = torch.where(regular[..., None], both, torch.nan)
-        found.append(_of_stacks(both, len(both) // stacks))
-    both_of_blocks = table(torch.cat(found, 1))
+        of_groups.append(_of_stacks(both, len(both) // stacks))
+    both_of_blocks = table(torch.cat(of_groups, 1))
     excess_of_stacks, variance_of_stacks = np.split(trimmed_mean(both_of_blocks), 2, -1)
     count = np.maximum((~np.isnan(both_of_blocks[..., :2])).sum(1), 1)
     return np.sqrt(np.maximum(excess_of_stacks - 2 * np.sqrt(variance_of_stacks / count), 0.0))
@@ -402,8 +402,8 @@ def blur_ratio(groups: list[FrameGroups], timing: RowTiming, motion: Motion) -> 
     Returns:
         (B, 3): ratio, its standard deviation, and the size of the expected difference relative to m.
     """
-    found = (_products_of_blur(group, timing, group.motion_of_groups(motion)) for group in groups)
-    parts, counts, moments_of_groups = zip(*found, strict=True)
+    of_groups = (_products_of_blur(group, timing, group.motion_of_groups(motion)) for group in groups)
+    parts, counts, moments_of_groups = zip(*of_groups, strict=True)
     # Least squares. The variance is that of the residuals, 8/3 of it because values share blocks, or by the scatter
     # of the scores of parts if that is larger: errors of interpolation are alike in neighbouring rows.
     products, count = torch.cat(parts, 1), torch.stack(counts).sum(0).clamp(min=1.0)  # (B, M, 3, 3) of M parts

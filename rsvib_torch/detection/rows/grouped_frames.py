@@ -100,13 +100,13 @@ class GroupedFrames:
         """All groups measured around a motion, as one record; ``keep_images`` for further rounds."""
         known = [None] * len(self.groups) if gradients is None else gradients
         count, view = sum(group.count for group in self.groups), self.view(motion)
-        parts, found, advance = [], [], steps(count, self.unit)
+        parts, of_groups, advance = [], [], steps(count, self.unit)
         for group, of_group in zip(self.groups, known, strict=True):
             part, of_part = self.measure_group(group, motion, view, of_group)
             parts.append(part)
-            found.append(of_part if keep_images else of_part.without_images())
+            of_groups.append(of_part if keep_images else of_part.without_images())
             advance(group.count)
-        return MeasuredRows(joined_groups(parts, self.timing.exposure_time, count), found, self.apart(found))
+        return MeasuredRows(joined_groups(parts, self.timing.exposure_time, count), of_groups, self.apart(of_groups))
 
     def measure_group(
         self, group: FrameGroups, motion: Motion, view: Motion, gradients: RowGradients | None

@@ -316,8 +316,8 @@ def _bands_reasons(start: BandStart, columns: int, motion: Motion, axes: int) ->
         np.diff(values[0], axis=1).reshape(*pairs, 2)  # px
         for values in (banded.displacements, residual_of_motion(banded, motion))
     )
-    found = banded.weights[0].min(-1).reshape(pairs) > 0
-    bands = compared_bands(np.where(found[..., None], offsets, np.nan), offsets - rest, np.ones_like(found))
+    is_measured = banded.weights[0].min(-1).reshape(pairs) > 0
+    bands = compared_bands(np.where(is_measured[..., None], offsets, np.nan), offsets - rest, np.ones_like(is_measured))
     left, spread = np.nanmax(bands["residual"], 0), np.nanmean(bands["size"], 0)
     against, allowed = scene_reasons(start.curve, columns, of_pairs=True)[0], np.maximum(_MAX_BAND_ERROR, 0.3 * spread)
     excess = left / allowed
@@ -524,9 +524,9 @@ def _nearly_blind(motion: FreeMotion, times: Tensor, timing: SensorTiming) -> li
     """
     if timing.frame_start_times is not None:
         return [False] * motion.num_axes
-    found = vibration_in_place_of(motion, float(times.min()), float(times.max())).frequency[:, 0] * timing.frame_period
-    cycles = (found - found.round()).abs() * len(times)
-    return ((found.round() >= 1) & (cycles < _NEARLY_BLIND)).tolist()
+    turns = vibration_in_place_of(motion, float(times.min()), float(times.max())).frequency[:, 0] * timing.frame_period
+    cycles = (turns - turns.round()).abs() * len(times)
+    return ((turns.round() >= 1) & (cycles < _NEARLY_BLIND)).tolist()
 
 
 # of the median mean square of residuals within a knot interval; smaller ones are noise. Of steps of 2 and 6 px within

@@ -163,7 +163,7 @@ class _Problem:
         place = np.arange(exists.shape[-1])
         self.is_frequency = (place < 3 * self.tones) & (place % 3 == 2)  # (P,)
         # (B, M) bool, parameters that are fitted, and those of them on which displacements depend linearly
-        self.free, self.linear = (these.reshape(len(active), -1) for these in (exists, exists & ~self.is_frequency))
+        self.free, self.linear = (columns.reshape(len(active), -1) for columns in (exists, exists & ~self.is_frequency))
         drifts = measurements.drifts[..., :drift_order]
         self.drift_columns = np.broadcast_to(drifts, (*drifts.shape[:3], self.axes, drift_order))
         self.root = measurements.root[:, :, None]  # (B, N, 1, A, A)
