@@ -44,8 +44,8 @@ class ImageMotion:
     def move(self, points: Tensor) -> Tensor:
         """Positions (x, y) in the frame of scene points (B, S, 2) in px."""
         start, exposure = self.starts[:, None], self.exposure_time[:, None, None]
-        rows, moved = rows_showing(points[..., 1], start, self.timing, self.vibration, exposure)
-        return torch.stack([points[..., 0] + moved[..., 0], rows], -1)
+        rows, displacement = rows_showing(points[..., 1], start, self.timing, self.vibration, exposure)
+        return torch.stack([points[..., 0] + displacement[..., 0], rows], -1)
 
     @full_precision
     def move_images(self, images: Tensor, interpolation: Interpolation) -> Tensor:
@@ -67,8 +67,8 @@ class ImageMotion:
         rows = torch.arange(R, dtype=torch.float64, device=masks.device)
         columns = torch.arange(W, dtype=torch.float64, device=masks.device)
         starts = self.starts[:, None] + rows * self.timing.row_time
-        moved = self.vibration.mean_displacement(starts, self.exposure_time[:, None])
-        x, y = moved[..., None].unbind(-2)  # (B, R, 1)
+        displacement = self.vibration.mean_displacement(starts, self.exposure_time[:, None])
+        x, y = displacement[..., None].unbind(-2)  # (B, R, 1)
         source_rows = mirrored((rows[:, None] - y).round().to(torch.int64), R)
         source_columns = mirrored((columns - x).round().to(torch.int64), W)
         index = (source_rows * W + source_columns).flatten(1)[:, None].expand(-1, C, -1)
@@ -80,8 +80,8 @@ class ImageMotion:
         count = int(sides[..., 1].abs().amax().ceil()) + 2  # points of a side, at most one row apart
         steps = torch.linspace(0.0, 1.0, count, dtype=boxes.dtype, device=boxes.device)
         points = boxes[..., None, :] + sides[..., None, :] * steps[:, None]  # (B, N, 4, count, 2)
-        moved = self.move(points.flatten(1, -2)).reshape(points.shape).flatten(2, 3)
-        lowest, highest = moved.amin(-2)[..., None, :], moved.amax(-2)[..., None, :]
+        corners = self.move(points.flatten(1, -2)).reshape(points.shape).flatten(2, 3)
+        lowest, highest = corners.amin(-2)[..., None, :], corners.amax(-2)[..., None, :]
         return torch.where(boxes > boxes.mean(-2, keepdim=True), highest, lowest)  # corners in the given order
 
 
@@ -219,8 +219,8 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         if input.numel() == 0:
             return input
         images = frames_to_row_order(input, self.timing)
-        moved = self._motion(params, images).move_images(images, flags["interpolation"])
-        return frames_from_row_order(moved, self.timing)
+        transformed = self._motion(params, images).move_images(images, flags["interpolation"])
+        return frames_from_row_order(transformed, self.timing)
 
     def apply_transform_mask(self, input: Tensor, params: Parameters, *_: object, **__: object) -> Tensor:
         """Move masks (B, C, H, W) to the nearest pixel."""
@@ -253,9 +253,9 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         sign = points.new_tensor([1, -1], dtype=torch.float64)
         rowwise = points.to(torch.float64).reshape(len(motion.starts), -1, *shape)
         rowwise = rowwise.flip(-1) if by_columns else rowwise
-        moved = move(motion, last + sign * rowwise if reverse else rowwise)
-        moved = last + sign * moved if reverse else moved
-        return (moved.flip(-1) if by_columns else moved).reshape(points.shape).to(points.dtype)
+        transformed = move(motion, last + sign * rowwise if reverse else rowwise)
+        transformed = last + sign * transformed if reverse else transformed
+        return (transformed.flip(-1) if by_columns else transformed).reshape(points.shape).to(points.dtype)
 
     def _motion(self, params: Parameters, like: Tensor) -> ImageMotion:
         """The drawn motion of a batch in row order."""

@@ -172,10 +172,10 @@ def check_fields(value: Any) -> None:
     """Check the fields of a dataclass against their annotations; lists become tuples, tables and tensors are copied."""
     kinds = hints_of(value.__class__)
     for name, given in tuple(vars(value).items()):
-        made = _checked(name, given, kinds[name], finite=False)
-        made = made.clone() if isinstance(made, Tensor) else made
-        if isinstance(made, (tuple, dict, Tensor)) and not isinstance(given, tuple):
-            object.__setattr__(value, name, made)
+        checked = _checked(name, given, kinds[name], finite=False)
+        checked = checked.clone() if isinstance(checked, Tensor) else checked
+        if isinstance(checked, (tuple, dict, Tensor)) and not isinstance(given, tuple):
+            object.__setattr__(value, name, checked)
 
 
 @cache

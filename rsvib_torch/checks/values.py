@@ -206,20 +206,20 @@ def options(group: type[_Group]) -> type[_Group]:
         return schema
 
     group.__get_pydantic_core_schema__ = classmethod(accept_tables)  # type: ignore[attr-defined]
-    made: Any = pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=_CONFIG)(group)
-    initialise = made.__init__
-    _describe(made)
+    decorated: Any = pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=_CONFIG)(group)
+    initialise = decorated.__init__
+    _describe(decorated)
 
     def __init__(self: _Group, *args: object, **given: object) -> None:  # noqa: N807
-        by_place = dict(zip(fields_of(made), args, strict=False))
+        by_place = dict(zip(fields_of(decorated), args, strict=False))
         values = {name: plain(value) for name, value in (by_place | given).items()}
         try:
             initialise(self, **values)
         except ValidationError as error:
-            raise mistakes_of(error, values, group=made)[0] from None
+            raise mistakes_of(error, values, group=decorated)[0] from None
 
-    made.__init__ = __init__
-    return made  # type: ignore[no-any-return]
+    decorated.__init__ = __init__
+    return decorated  # type: ignore[no-any-return]
 
 
 def _describe(group: type) -> None:

@@ -161,7 +161,7 @@ def _page(given: RunCommand, stored: stacks.StackManifest, first: DetectedVibrat
         after = io.read_frames(given.restored, [0] if joint else shown, scale)
     # 3. What was found in them.
     detected = first if isinstance(first, detection.DetectionResult) else None  # of a steady vibration
-    alone = detected is not None and len(stored.windows) == 1
+    only_window = detected is not None and len(stored.windows) == 1
     timing = io.timing_from_first_frame(given.settings.timing, given.info)
     return reports.Report(
         title=printable(f"Vibration in {given.frames.name}"),
@@ -170,10 +170,10 @@ def _page(given: RunCommand, stored: stacks.StackManifest, first: DetectedVibrat
         frames=before.nan_to_num(0.0),
         restored=after,
         first=next(iter(shown), 0),
-        timing=detected.timing if detected is not None and not alone and detected.timing is not None else timing,
+        timing=detected.timing if detected is not None and not only_window and detected.timing is not None else timing,
         detection=detected,
         outcome=record.outcome,
-        windows=None if alone else stored,
+        windows=None if only_window else stored,
     )
 
 

@@ -216,8 +216,8 @@ class RestoringCommand(StackCommand):
         full_scale = self.scale if self.info.is_integer else None
         method: str = (options | given).get("method", "exact")
         if method != options.get("method", "exact"):  # other options belong to the configured method
-            kept = ("saturation", *method_options(method))
-            options = {name: value for name, value in options.items() if name in kept}
+            usable = ("saturation", *method_options(method))
+            options = {name: value for name, value in options.items() if name in usable}
         options |= given
         RestorationOptions(**options)  # raises an error for wrong ones
         level = options.get("saturation")

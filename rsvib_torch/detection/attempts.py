@@ -151,8 +151,8 @@ def _moving_parts(refined: FittedRows, timing: RowTiming, stacks: GreyFrames) ->
     motion = motion_of_fit(shrunk(refined.fit, compared_intervals(timing, num_frames)), stacks.images.device)
     first, in_frames = 0, []
     for group, gradients in zip(refined.frames.groups, refined.frames.measure(motion).gradients, strict=True):
-        moved, _, regular = map(table, displacements_of_parts(gradients))
-        far = np.abs(moved - np.median(moved, 2, keepdims=True)).max(-1) > _MOVES_BY_ITSELF  # (B M, N, 4)
+        shift, _, regular = map(table, displacements_of_parts(gradients))
+        far = np.abs(shift - np.median(shift, 2, keepdims=True)).max(-1) > _MOVES_BY_ITSELF  # (B M, N, 4)
         for of_group in np.moveaxis(split_axis(far & regular[..., None], 0, count, -1), 1, 0):
             in_frames.append((slice(first, first + group.size), of_group))
             first += group.size - 1
@@ -191,8 +191,8 @@ def _without_parallax(stacks: GreyFrames, timing: RowTiming, options: DetectionO
         allowed = np.maximum(_MAX_UNLIKE * whole.std(0), _MAX_UNLIKE_PX)
         for part in (slice(0, half), slice(width - half, width)):
             of_half = attempt(stack.columns(part), timing, options, Hypothesis(FieldScale(2, half, height)))
-            moved = tone_displacements(of_half.fit, row_starts, timing.exposure_time)[0] - whole
-            if any(of_half.findings[0]) or (moved.std(0) > allowed).any():
+            difference = tone_displacements(of_half.fit, row_starts, timing.exposure_time)[0] - whole
+            if any(of_half.findings[0]) or (difference.std(0) > allowed).any():
                 break
         else:
             findings[index] = tuple(

@@ -302,13 +302,13 @@ class OtherMotion:
         is_far = (size[..., :2] > _FAR).any(-1, keepdims=True)
         least = np.where(is_far, _VAGUE**-2, 0.0)[..., None]
         measured = visible & (measurements.weights[..., :2] > least).all(-1)
-        registered, seen = (split_axis(rows, 1, measurements.groups, -1).sum(2) for rows in (measured, visible))
+        registered, shown = (split_axis(rows, 1, measurements.groups, -1).sum(2) for rows in (measured, visible))
         return cls(
             size=size,
             unexplained=np.maximum(measurements.unexplained(residual), measurements.of_worst_group(residual)),
             correlated=measurements.correlated(residual),
             differential=differential,
-            measured=(np.where(seen > 0, registered / np.maximum(seen, 1), 1.0) * seen.any(1, keepdims=True)).min(1),
+            measured=(np.where(shown > 0, registered / np.maximum(shown, 1), 1.0) * shown.any(1, keepdims=True)).min(1),
             blur=np.broadcast_to(np.array([1.0, 0.0, 0.0]), (len(residual), 3)),
         )
 
@@ -330,15 +330,15 @@ class OtherMotion:
 def cholesky_root(information: Array) -> Array:
     """Upper triangular R (..., A, A) with ``W = R^T R`` of information matrices W, rows of 0 where W is singular."""
     axes = information.shape[-1]
-    root, rest = np.zeros_like(information), information
+    root, remainder = np.zeros_like(information), information
     for axis in range(axes):
-        square = rest[..., :1, :1]
+        square = remainder[..., :1, :1]
         scale = (square > 0) / np.sqrt(np.where(square > 0, square, 1.0))
-        row = rest[..., :1, :] * scale  # (..., 1, A - axis)
+        row = remainder[..., :1, :] * scale  # (..., 1, A - axis)
         root[..., axis, axis:] = row[..., 0, :]
         if axis + 1 < axes:
             later = row[..., 1:]
-            rest = rest[..., 1:, 1:] - later.mT * later
+            remainder = remainder[..., 1:, 1:] - later.mT * later
     return root
 
 

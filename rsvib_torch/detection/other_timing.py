@@ -154,8 +154,8 @@ def measured_period(measurements: Measurements, fit: ToneFit, starts: Array) -> 
         precision += float(np.square(response).sum())
         chi_square += float(np.square(problem.residual).sum())
     change = total / max(precision, 1e-300)
-    left = max(1 - total * change / max(chi_square, 1e-300), 0.0)  # of the square of the residual
-    std = math.sqrt(left / max(precision, 1e-300))
+    unexplained = max(1 - total * change / max(chi_square, 1e-300), 0.0)  # of the square of the residual
+    std = math.sqrt(unexplained / max(precision, 1e-300))
     return 1 + change if max(_SIGNIFICANT * std, _SMALLEST) < abs(change) < 0.5 else None
 
 
@@ -177,8 +177,8 @@ def _with_starts(
     The tones start at ``frequencies`` (F, A, 1) in Hz; None searches for them.
     """
     trial = measurements.repeated(len(others))
-    moved = (others - starts)[np.arange(len(others))[:, None, None], _frame_of_rows(trial, starts)]
-    trial = replace(trial, exposure_starts=trial.exposure_starts + moved)
+    delay = (others - starts)[np.arange(len(others))[:, None, None], _frame_of_rows(trial, starts)]
+    trial = replace(trial, exposure_starts=trial.exposure_starts + delay)
     if frequencies is None:
         interval = max(BLOCK_ROWS * timing.row_time, 0.5 * timing.exposure_time)
         return trial, find_tones(trial, interval, 1, stretches=False, iterations=_ITERATIONS)

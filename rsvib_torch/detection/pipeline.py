@@ -132,8 +132,8 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
     known_std = displacement_std(fit, row_starts, timing.exposure_time)
     stated, if_hidden = with_further_tones(measurements, fit, row_starts, number_is_known=options.tones is not None)
     if refined is not None:
-        apart, exposure = float(intervals[0]), timing.exposure_time
-        stated, if_hidden = (with_unknown_image_motion(one, apart, exposure) for one in (stated, if_hidden))
+        spacing, exposure = float(intervals[0]), timing.exposure_time
+        stated, if_hidden = (with_unknown_image_motion(one, spacing, exposure) for one in (stated, if_hidden))
     vibration, std = stated.vibration()
     fit, std_if_hidden_tone = if_hidden.fit, if_hidden.vibration()[1]
 

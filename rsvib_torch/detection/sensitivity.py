@@ -85,8 +85,8 @@ def timing_sensitivity(fit: ToneFit, timing: RowTiming, num_frames: int, num_row
         timings = [replace(timing, **{name: stated * (1 + sign * _STEP)}) for sign in (-1, 1)]
         lower, higher = (model_displacements(record(one), fit) for one in timings)
         change = (higher - lower) / (2 * _STEP)
-        moved = -inverses @ np.moveaxis(change, -1, 1).reshape(batch, axes, -1, 1)
-        by_tones = split_axis(moved[:, :, : 3 * tones, 0], -1, tones, 3)
+        changes = -inverses @ np.moveaxis(change, -1, 1).reshape(batch, axes, -1, 1)
+        by_tones = split_axis(changes[:, :, : 3 * tones, 0], -1, tones, 3)
         along = fit.coefficients.conj() * (by_tones[..., 0] + 1j * by_tones[..., 1])
         amplitude = np.where(fit.active, along.real / np.square(size), 0.0)
         frequency = np.where(fit.active, by_tones[..., 2] / np.maximum(fit.frequencies, 1e-300), 0.0)
@@ -124,8 +124,8 @@ def displacements_by_row_time(measured: Measurements, motion: Motion, timing: Ro
     times, starts = measured.exposure_starts, table(timing.frame_starts(num_frames))
     frames = np.searchsorted(starts, times + 0.5 * timing.row_time, "right") - 1
     later = times + (timing.row_time_std / timing.row_time) * (times - starts[np.maximum(frames, 0)])
-    moved = [table(motion.mean_displacement(tensor(at), measured.exposure_time)) for at in (times, later)]
-    return measured.relative(moved[1] - moved[0])
+    displacements = [table(motion.mean_displacement(tensor(at), measured.exposure_time)) for at in (times, later)]
+    return measured.relative(displacements[1] - displacements[0])
 
 
 def assumptions(
@@ -155,9 +155,9 @@ def assumptions(
         )
     intervals = other_intervals(timing, timing.frame_starts(num_frames), num_rows)
     if intervals is not None:
-        apart = " to ".join(dict.fromkeys(f"{interval:.4g}" for interval in intervals))
+        listed = " to ".join(dict.fromkeys(f"{interval:.4g}" for interval in intervals))
         sentences.append(
-            f"frame_start_times {apart} s apart, although the frame period is "
+            f"frame_start_times {listed} s apart, although the frame period is "
             f"{timing.frame_period:.4g} s (frame_rows x row_time); wrong times give wrong frequencies"
         )
     if timing.frame_start_times is None and timing.frame_rows == num_rows:

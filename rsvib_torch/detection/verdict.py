@@ -188,8 +188,8 @@ def _alias_reasons(axis: str, numbers: Table, timing: RowTiming) -> list[Reason]
     for (size, hertz, std), (other_size, other_hertz, other_std) in combinations(tones, 2):
         cycles = abs(hertz - other_hertz) * timing.frame_period
         error = 3 * math.hypot(std, other_std) * timing.frame_period
-        apart = max(abs(cycles - round(cycles)), _LEAST_ALIAS_ERROR)
-        if min(size, other_size) > 0 and round(cycles) and apart < error < _MOST_ALIAS_ERROR:
+        distance = max(abs(cycles - round(cycles)), _LEAST_ALIAS_ERROR)
+        if min(size, other_size) > 0 and round(cycles) and distance < error < _MOST_ALIAS_ERROR:
             return [Reason("tones_alias", axis, hertz, other_hertz)]
     return []
 
@@ -314,11 +314,11 @@ def rotation_possible(other: OtherMotion, uneven: Array, aspect: float) -> Array
     ``uneven`` (B, 2) px are differences of the displacements along a row that are not linear in the column; ``aspect``
     is the rows of a frame over its columns.
     """
-    apart = other.differential[..., ::-1]
-    even = np.maximum(_MAX_UNEVEN * _max_apart(other.size), _MAX_UNEVEN_PART * apart)
+    differential = other.differential[..., ::-1]
+    even = np.maximum(_MAX_UNEVEN * _max_apart(other.size), _MAX_UNEVEN_PART * differential)
     is_uneven = (uneven[..., ::-1] > even).any(-1)
-    moved = np.maximum(other.permitted, _MAX_MOVED * max(1.0, aspect) * apart.max(-1, keepdims=True))
-    return halves_move_apart(other) & ~is_uneven & ~(other.unexplained > moved).any(-1)
+    limit = np.maximum(other.permitted, _MAX_MOVED * max(1.0, aspect) * differential.max(-1, keepdims=True))
+    return halves_move_apart(other) & ~is_uneven & ~(other.unexplained > limit).any(-1)
 
 
 def rotation_reasons(axis: int, axes: int, differential: Sequence[float], size: float) -> list[Reason]:
@@ -333,13 +333,13 @@ def rotation_reasons(axis: int, axes: int, differential: Sequence[float], size: 
     """
     allowed = float(_max_apart(size))
     if axes > 2:
-        apart = max(differential)
+        rms = max(differential)
     elif differential[axis] > _MAX_TWO_MOTIONS * allowed:
-        apart = differential[axis]
+        rms = differential[axis]
     else:
-        apart = differential[1 - axis]
+        rms = differential[1 - axis]
     code = "strips_apart" if axes > 2 else "halves_apart"
-    return [Reason(code, AXIS_NAMES[axis], apart, allowed)] if apart > allowed else []  # not if it is NaN
+    return [Reason(code, AXIS_NAMES[axis], rms, allowed)] if rms > allowed else []  # not if it is NaN
 
 
 # Exposure
@@ -378,15 +378,15 @@ def exposure_reasons(timing: RowTiming, ratio: float, std: float, size: float | 
 # Recorded motions
 
 
-def recording_reasons(moved: Sequence[float], unexplained: Sequence[float], other: float | None) -> list[Reason]:
+def recording_reasons(motion: Sequence[float], unexplained: Sequence[float], other: float | None) -> list[Reason]:
     """Reasons against a recorded motion, from rms motion in px by it and beside it, and another clock offset in s."""
-    reasons, largest = [], max(moved)
+    reasons, largest = [], max(motion)
     if largest < _MIN_MOTION:
         reasons.append(Reason("recorded_motion_too_small", None, largest, _MIN_MOTION))
-    for name, size, rest in zip(AXIS_NAMES, moved, unexplained, strict=False):
+    for name, size, residual in zip(AXIS_NAMES, motion, unexplained, strict=False):
         allowed = max(0.25 * size, 0.05)  # px
-        if rest > allowed:
-            reasons.append(Reason("recording_incomplete", name, rest, allowed))
+        if residual > allowed:
+            reasons.append(Reason("recording_incomplete", name, residual, allowed))
     if other is not None:
         reasons.append(Reason("motion_repeats", details={"offset": other}))
     return reasons

@@ -72,15 +72,15 @@ def _information(
         return _sensitivity(motion, times)[unknown]
 
     # rows (S, T) of the frames that show each row of the scene, and how many of them per row of the scene: dr / ds
-    moved = _of_middle_column(motion, timing, num_frames, height)
+    displacement = _of_middle_column(motion, timing, num_frames, height)
     begin = timing.frame_starts(num_frames, device)
-    rows, _ = rows_showing(y[:, None] - top, begin.expand(len(y), num_frames), timing, moved)
+    rows, _ = rows_showing(y[:, None] - top, begin.expand(len(y), num_frames), timing, displacement)
     moments = begin + rows * timing.row_time
-    seen = ((rows >= 0) & (rows <= height - 1)) * torch.gradient(rows, dim=0)[0]
+    visible = ((rows >= 0) & (rows <= height - 1)) * torch.gradient(rows, dim=0)[0]
 
     # products of the gradients over the columns that all frames show
-    shift = moved.mean_displacement(moments, timing.exposure_time)[..., 0]
-    low, high = (torch.where(seen > 0, shift, far) for far in (math.inf, -math.inf))
+    shift = displacement.mean_displacement(moments, timing.exposure_time)[..., 0]
+    low, high = (torch.where(visible > 0, shift, far) for far in (math.inf, -math.inf))
     window = (x - left >= -low.amin(1, keepdim=True)) & (x - left <= width - 1 - high.amax(1, keepdim=True))
     from_centre = (x - left - 0.5 * (width - 1))[None], (y - top - 0.5 * (height - 1))[:, None]
     factors = displacement_factors(*from_centre, motion.num_axes)  # (Hs, Ws, 2, A)
@@ -91,9 +91,9 @@ def _information(
     times = nodes * timing.exposure_time
     of_axis = functional.one_hot(axes, factors.shape[-1]).to(weights)
     derivatives = (sensitivity(moments[..., None] + times) @ weights)[..., None] * of_axis[:, None, None]
-    mean = (seen[..., None] * derivatives).sum(2, keepdim=True) / seen.sum(1).clamp(min=1e-300)[:, None, None]
+    mean = (visible[..., None] * derivatives).sum(2, keepdim=True) / visible.sum(1).clamp(min=1e-300)[:, None, None]
     relative = derivatives - mean
-    shared = seen * ((seen > 0).sum(1, keepdim=True) > 1)
+    shared = visible * ((visible > 0).sum(1, keepdim=True) > 1)
     # summed over rows s of the scene, frames t, and components a and b
     information = torch.einsum("psta,st,sab,qstb->pq", relative, shared, products, relative)
 

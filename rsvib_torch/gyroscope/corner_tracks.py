@@ -46,9 +46,9 @@ class CornerTracks:
         """(M, 2, 2) information for a start: 1 for displacements near the median of their pair, and 0."""
         used, index = self.pair.unique(return_inverse=True)
         middle = torch.stack([self.offsets[self.pair == pair].median(0).values for pair in used])
-        rest = (self.offsets - middle[index]).abs()
-        near = (rest < 5 * 1.4826 * rest.median(0).values.clamp(min=0.1)).all(-1)
-        return near[:, None, None] * torch.eye(2, dtype=rest.dtype)
+        residual = (self.offsets - middle[index]).abs()
+        near = (residual < 5 * 1.4826 * residual.median(0).values.clamp(min=0.1)).all(-1)
+        return near[:, None, None] * torch.eye(2, dtype=residual.dtype)
 
 
 def corner_tracks(

@@ -123,8 +123,8 @@ class AngularRates(Result, units={"times": "s", "rates": "rad/s"}, shapes={"time
         turned = _running_product(np.concatenate([[[0.0, 0.0, 0.0, 1.0]], steps.as_quat()]))
         nearest = int((self.times - reference).abs().argmin())
         at = self.times.new_tensor([reference])
-        rest = Rotation.from_rotvec(self.rotation(self.times[nearest : nearest + 1], at).cpu().numpy()[0])
-        origin = Rotation.from_quat(turned[nearest]) * rest
+        within = Rotation.from_rotvec(self.rotation(self.times[nearest : nearest + 1], at).cpu().numpy()[0])
+        origin = Rotation.from_quat(turned[nearest]) * within
         vectors = (origin.inv() * Rotation.from_quat(turned)).as_rotvec()
         return torch.from_numpy(vectors).to(self.times.device)
 

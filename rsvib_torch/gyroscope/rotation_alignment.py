@@ -124,7 +124,7 @@ class RotationAlignment(
         axes = [letter.lower() if letter.isupper() else f"-{letter}" for letter in self.orientation]
         verdict = "reliable" if self.reliable else f"not reliable: {'; '.join(self.reasons)}"
         bias, std = self.bias.tolist(), self.bias_std.tolist()
-        moved, rest = (self.predicted - self.predicted.mean(0)).square().mean(0).sqrt(), self.unexplained
+        motion, residual = (self.predicted - self.predicted.mean(0)).square().mean(0).sqrt(), self.unexplained
         names = ("X (px)", "Y (px)", "roll (rad)")
         return "\n".join(
             [
@@ -136,7 +136,7 @@ class RotationAlignment(
                 f"{measured_text(1e6 * self.row_time, 1e6 * self.row_time_std or None)} us",
                 text_table(
                     ["between frames", "by the gyroscope (rms)", "not explained"],
-                    [[names[k], measured_text(moved[k]), measured_text(rest[k], digits=2)] for k in range(3)],
+                    [[names[k], measured_text(motion[k]), measured_text(residual[k], digits=2)] for k in range(3)],
                 ),
                 wrapped(verdict),
             ]
@@ -302,9 +302,9 @@ def _result(
     first, last = float(middles[0, 0]) - 0.5 * rows * row_time, float(middles[-1, 1]) + 0.5 * rows * row_time
     clock = scale * (torch.tensor([first, last], dtype=torch.float64) - model.middle) + at
 
-    moved = model.components(fit.parameters, model.tracks.times(row_time))  # of the rows of the corners
-    moved = (moved - moved.mean(0)).square().mean(0).sqrt()
-    reasons = recording_reasons(moved[:2].tolist(), unexplained[:2].tolist(), other)
+    displacement = model.components(fit.parameters, model.tracks.times(row_time))  # of the rows of the corners
+    displacement = (displacement - displacement.mean(0)).square().mean(0).sqrt()
+    reasons = recording_reasons(displacement[:2].tolist(), unexplained[:2].tolist(), other)
     reasons += ambiguous
     # Parameters that are not determined.
     *_, fits_focal_length, fits_row_time = model.free
@@ -363,7 +363,7 @@ def _motion(fit: RotationFit, clock: Tensor, margin: int = 4) -> FreeMotion:
     high = min(int(torch.searchsorted(times, clock[1])) + margin, len(times))
     part = AngularRates(times[low:high], model.rates.rates[low:high].cpu() - parameters[:3])
     turned = part.attitude(float(parameters[3])) @ orientation_matrix(model.orientation).T
-    moved = image_components(turned, parameters[5])
+    path = image_components(turned, parameters[5])
     recorded_times = (part.times - parameters[3]) / parameters[4] + model.middle
     camera = replace(model.camera, focal_length=float(parameters[5]))
-    return FreeMotion.from_samples(recorded_times, moved, spacing=float(recorded_times.diff().median()), camera=camera)
+    return FreeMotion.from_samples(recorded_times, path, spacing=float(recorded_times.diff().median()), camera=camera)

@@ -261,7 +261,7 @@ def _solved(fit: RotationFit, linear: _Linear) -> tuple[RotationFit, Tensor, Ten
     parameters = fit.parameters + change[:7]
     parameters[5] = parameters[5].clamp(min=MIN_FOCAL_LENGTH)
     cost = (information * linear.residual.square()).sum() + (prior * fit.effects.square()).sum()
-    moved = replace(
+    solved = replace(
         fit,
         parameters=parameters,
         covariance=covariance[:7, :7],
@@ -273,7 +273,7 @@ def _solved(fit: RotationFit, linear: _Linear) -> tuple[RotationFit, Tensor, Ten
     variances = (inverse + by_parameters @ covariance @ by_parameters.mT).diagonal(dim1=-2, dim2=-1)
     reduced = linear.slopes - linear.effects @ by_parameters[tracks.pair]
     influence = torch.einsum("mi,mi,mia->ma", information, linear.residual, reduced) @ covariance[:, :7]
-    return moved, variances, influence
+    return solved, variances, influence
 
 
 def _weighed(fit: RotationFit, linear: _Linear, of_effects: Tensor, follows: Tensor) -> Errors:
@@ -368,15 +368,15 @@ def _with_correlated_errors(fit: RotationFit) -> RotationFit:
     wide = errors.effects * ((1 + rho) / (1 - rho) * pairs / max(pairs - int(free.sum()) / 3, 1.0)).sqrt()
     values, slopes, turned = _residuals(fit)
     linear, wider = _linear(fit, values, slopes, turned), replace(fit, errors=replace(errors, effects=wide))
-    moved, _, influence = _solved(wider, linear)
+    refitted, _, influence = _solved(wider, linear)
     cells = influence.new_zeros(CELL_ROWS * CELL_COLUMNS, 7).index_add(0, tracks.cell, influence)
     occupied = max(int((cells.abs().sum(-1) > 0).sum()), 2)
     clustered = cells.square().sum(0) * occupied / (occupied - 1)
     if pairs > 1:
         clustered = torch.maximum(clustered, _sums(tracks, influence).square().sum(0) * pairs / (pairs - 1))
-    ratio = (clustered / moved.covariance.diagonal().clamp(min=1e-300)).clamp(min=1.0)
+    ratio = (clustered / refitted.covariance.diagonal().clamp(min=1e-300)).clamp(min=1.0)
     inflation = float(ratio[free].mean())
-    covariance = moved.covariance * ratio.sqrt() * ratio.sqrt()[:, None]
+    covariance = refitted.covariance * ratio.sqrt() * ratio.sqrt()[:, None]
     # Noise of the rates, which turns all corners of a row alike: the covariance of the parameters over random draws.
     rates, generator = fit.model.rates, torch.Generator().manual_seed(0)
     noise, predicted = rates.noise, fit.model.predicted(fit.parameters)
@@ -395,7 +395,7 @@ def _with_correlated_errors(fit: RotationFit) -> RotationFit:
     gains[1, 3] = -row * gains[1, 6]
     gains[2, 3] = _ROW_ERROR * parameters[6]
     covariance = (covariance + gains.mT @ gains) * torch.outer(free, free)
-    return replace(moved, errors=errors, covariance=covariance, inflation=inflation)
+    return replace(refitted, errors=errors, covariance=covariance, inflation=inflation)
 
 
 def _half_sphere(count: int = 400) -> Tensor:

@@ -66,18 +66,18 @@ def search_orientations(
     # roots of a matrix and of its inverse differ by a rotation only; eigenvalues may be 0
     values, vectors = torch.linalg.eigh(information[used])
     white = values.clamp(min=0).sqrt()[..., None] * vectors.mT
-    factors, moved = white @ factors, (white @ tracks.offsets[used, :, None])[..., 0]
+    factors, white_offsets = white @ factors, (white @ tracks.offsets[used, :, None])[..., 0]
     times = tracks.times(row_time)[used]
     unknown = factors * torch.cat([times.diff().expand(-1, 3), torch.ones_like(x)[:, None]], -1)[:, None]
     factors = factors[..., :3]
 
     # 2. Products of the displacements and of the rotations, without the part that is not known.
     orthogonal = torch.linalg.qr(unknown.flatten(0, 1))[0].unflatten(0, (-1, 2))  # (M, 2, 4)
-    along = torch.einsum("mic,mi->mc", factors, moved)
+    along = torch.einsum("mic,mi->mc", factors, white_offsets)
     pairs = torch.einsum("mic,mid->mcd", factors, factors).flatten(1)
     hidden = torch.einsum("min,mic->mnc", orthogonal, factors).flatten(1)
-    of_moved = torch.einsum("min,mi->n", orthogonal, moved)
-    energy = moved.square().sum() - of_moved.square().sum()
+    of_moved = torch.einsum("min,mi->n", orthogonal, white_offsets)
+    energy = white_offsets.square().sum() - of_moved.square().sum()
     products, squares = [], []
     # integrals of the rates at equally spaced times, interpolated linearly: 20 times faster than the spline
     knots = np.arange(rates.start, rates.end + step, min(0.5 / rates.sample_rate, step))

@@ -154,8 +154,8 @@ def recorded_offsets(
     places = still
     for _ in range(_ROUNDS):  # the row of a place determines when it was recorded
         rows = places[along] if timing.readout_direction == "forward" else count - 1 - places[along]
-        moved = torch.from_numpy(of_rows(rows.clamp(grid[0], grid[-1])))
-        before, places = places, still + displacement_at(moved, x, y, motion.camera).movedim(-1, 0)
+        displacement = torch.from_numpy(of_rows(rows.clamp(grid[0], grid[-1])))
+        before, places = places, still + displacement_at(displacement, x, y, motion.camera).movedim(-1, 0)
         if float((places[along] - before[along]).abs().max()) < _CLOSE:
             break
     return (places - pixels).numpy(), weights
@@ -166,10 +166,10 @@ def places_at_rest(motion: Motion, recorded: Array, starts: Array, exposure_time
 
     The places q (N, 2) were recorded in exposures from ``starts`` (N,) in s on.
     """
-    moved = motion.mean_displacement(torch.from_numpy(starts), exposure_time)
+    displacement = motion.mean_displacement(torch.from_numpy(starts), exposure_time)
     still = q = torch.from_numpy(recorded)
     for _ in range(3):  # each makes the error smaller by the roll and zoom: 1e-4 px with 0.05 rad and 20 px
-        still = q - displacement_at(moved, still[:, 0], still[:, 1], motion.camera)
+        still = q - displacement_at(displacement, still[:, 0], still[:, 1], motion.camera)
     return still.numpy()
 
 

@@ -180,9 +180,9 @@ class Camera:
         for _ in range(_NEWTON_STEPS):
             there = self._distorted(u, v)
             a, b, c, d = self._distortion_slope(u, v).flatten(-2).unbind(-1)
-            rest, other = along - there[0], across - there[1]
+            error_x, error_y = along - there[0], across - there[1]
             determinant = a * d - b * c
-            u, v = u + (d * rest - b * other) / determinant, v + (a * other - c * rest) / determinant
+            u, v = u + (d * error_x - b * error_y) / determinant, v + (a * error_y - c * error_x) / determinant
         return u, v
 
     def check_size(self, width: int, height: int) -> None:
@@ -221,11 +221,11 @@ class Camera:
         turned_x = cosine * u - sine * (yaw - roll * v) + along * pitch
         turned_y = cosine * v - sine * (roll * u - pitch) + along * yaw
         turned_z = cosine - sine * (pitch * v - yaw * u) + along * roll
-        moved = torch.stack(self._distorted(turned_x / turned_z, turned_y / turned_z), -1)
-        rest = torch.stack(self._distorted(u, v), -1)
+        turned = torch.stack(self._distorted(turned_x / turned_z, turned_y / turned_z), -1)
+        at_rest = torch.stack(self._distorted(u, v), -1)
         if components.shape[-1] > 3:
-            moved = moved * (1 + components[..., 3:])
-        return self.focal_length * (moved - rest)
+            turned = turned * (1 + components[..., 3:])
+        return self.focal_length * (turned - at_rest)
 
     def factors(self, x: Tensor, y: Tensor, axes: int) -> Tensor:
         """Displacement (S, 2, A) by unit components at positions (S) in px from the centre, for small angles."""
@@ -286,8 +286,8 @@ def _corners(width: float, height: float, like: Tensor) -> tuple[Tensor, Tensor]
 def largest_at(components: Tensor, x: Tensor, y: Tensor, camera: Camera | None) -> Tensor:
     """Bound (..., 2) in px on the displacement at P places (P, ...), by components within bounds (..., A)."""
     factors = displacement_factors(x, y, components.shape[-1], camera).abs().amax(0)
-    moved: Tensor = (factors @ components[..., None])[..., 0]
-    return moved if camera is None else moved * _BEYOND_LINEAR
+    displacement: Tensor = (factors @ components[..., None])[..., 0]
+    return displacement if camera is None else displacement * _BEYOND_LINEAR
 
 
 def largest_in_frame(components: Tensor, width: int, height: int, camera: Camera | None = None) -> Tensor:

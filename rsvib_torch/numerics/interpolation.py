@@ -150,11 +150,11 @@ def correlated(samples: Tensor, kernels: Tensor, dim: int, step: int = 1) -> Ten
     products = torch.bmm(matrix.reshape(1, -1, span).expand(len(every), -1, -1), every)
     values: Tensor = products.view(*windows.shape[:-2], number, block, -1).movedim(-3, 0).flatten(-3, -2)
     # 2. The values behind the last whole block.
-    rest = length - count * block
-    if rest:
-        near = (rest - 1) * step + taps
-        last = matrix[:, :rest, :near].flatten(0, 1) @ rows[..., count * block * step :, :][..., :near, :]
-        values = torch.cat([values, last.unflatten(-2, (number, rest)).movedim(-3, 0)], -2)
+    remainder = length - count * block
+    if remainder:
+        near = (remainder - 1) * step + taps
+        last = matrix[:, :remainder, :near].flatten(0, 1) @ rows[..., count * block * step :, :][..., :near, :]
+        values = torch.cat([values, last.unflatten(-2, (number, remainder)).movedim(-3, 0)], -2)
     return values.movedim(-2, dim + 1 if dim >= 0 else dim)
 
 

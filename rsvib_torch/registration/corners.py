@@ -78,10 +78,10 @@ class Corners:
     def joined(parts: Sequence["Corners"]) -> "Corners":
         """The corners of all pairs."""
         pairs = np.concatenate([np.full(len(part.rows), number) for number, part in enumerate(parts)])
-        rest = (
+        following = (
             [getattr(part, name) for part in parts] for name in ("rows", "times", "places", "offsets", "layer", "blur")
         )
-        return Corners(pairs, *(np.concatenate(values) for values in rest))
+        return Corners(pairs, *(np.concatenate(values) for values in following))
 
 
 class CornerFollower:
@@ -155,12 +155,12 @@ def _agreeing(starts: Points, ends: Points, axis: int, length: int, scale: int) 
     affine, inliers = cv2.estimateAffine2D(starts, ends, method=cv2.USAC_MAGSAC, ransacReprojThreshold=wobble)
     if affine is None:
         return agree
-    inside, rest = inliers[:, 0] > 0, ends - starts @ affine[:, :2].T - affine[:, 2]
+    inside, residual = inliers[:, 0] > 0, ends - starts @ affine[:, :2].T - affine[:, 2]
     parts = (starts[:, axis] * _PARTS / length).astype(np.int64)
     for number in np.unique(parts[inside]):
         part = inside & (parts == number)
-        common = np.median(rest[part], 0) if part.sum() >= _MIN_CORNERS else 0.0
-        agree[part] = np.hypot(*(rest[part] - common).T) < limit
+        common = np.median(residual[part], 0) if part.sum() >= _MIN_CORNERS else 0.0
+        agree[part] = np.hypot(*(residual[part] - common).T) < limit
     return agree
 
 
@@ -179,8 +179,8 @@ def _in_layer(starts: Points, ends: Points, votes: NDArray[np.int64], scale: int
     for limit in _LAYER_LIMITS / scale:
         similarity, inside = cv2.estimateAffinePartial2D(starts[decide], ends[decide], ransacReprojThreshold=limit)
         if similarity is not None and inside.mean() > 0.5:
-            rest = ends - starts @ similarity[:, :2].T - similarity[:, 2]
-            return np.asarray(np.hypot(*rest.T) < 2 * limit)
+            residual = ends - starts @ similarity[:, :2].T - similarity[:, 2]
+            return np.asarray(np.hypot(*residual.T) < 2 * limit)
     return np.ones(len(starts), bool)
 
 
@@ -272,8 +272,8 @@ def find_corners(grey: Grey, most: int, known: Points = _NO_CORNERS[0], mask: Gr
         if strongest is not None:
             x, y = strongest[:, 0].T.astype(np.int64) + np.array([[left], [top]])
             places = np.stack([x, y], -1)[quality[y, x] > floor].astype(np.float64)
-            apart = np.abs(places[:, None] - known).max(-1).min(-1, initial=np.inf) >= distance
-            corners.append(places[apart][: number - filled[row, column]])
+            is_new = np.abs(places[:, None] - known).max(-1).min(-1, initial=np.inf) >= distance
+            corners.append(places[is_new][: number - filled[row, column]])
     return np.concatenate(corners)
 
 

@@ -266,9 +266,9 @@ def register_phase(task: BandTask) -> tuple[Tensor, Tensor]:
     fraction = torch.zeros_like(shift, dtype=task.first.dtype)
     template = take_windows(task.first, places[..., 1], places[..., 0], task.height, task.width)
     for _ in range(2):  # the window follows the content: to a whole pixel, then to a fraction
-        moved = places + shift
-        inside = (moved[..., 1] >= 0) & (moved[..., 1] + task.height <= num_rows)
-        window = take_windows(task.second, moved[..., 1], moved[..., 0], task.height, task.width)
+        shifted = places + shift
+        inside = (shifted[..., 1] >= 0) & (shifted[..., 1] + task.height <= num_rows)
+        window = take_windows(task.second, shifted[..., 1], shifted[..., 0], task.height, task.width)
         surface = _phase_surface(template, window, fraction)
         offsets, quality = fine_offsets(task, shift, surface, valid & inside)
         best = torch.where(torch.isfinite(offsets), offsets, shift.to(offsets.dtype))

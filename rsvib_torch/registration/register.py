@@ -289,8 +289,8 @@ def _standardised(images: Tensor) -> Tensor:
     """Images (B, T, H, W) less their mean over 31 x 31 px (light, vignetting, shading), with unit variance."""
     size = min(31, (min(images.shape[-2:]) - 1) // 2 * 2 + 1)
     mean = functional.pad(images, [size // 2] * 4, mode="reflect")
-    for dim, left in ((-1, (1, 0)), (-2, (0, 0, 1, 0))):  # running sums
-        total = functional.pad(mean.cumsum(dim), left)
+    for dim, padding in ((-1, (1, 0)), (-2, (0, 0, 1, 0))):  # running sums
+        total = functional.pad(mean.cumsum(dim), padding)
         count = total.shape[dim] - size
         mean = (total.narrow(dim, size, count) - total.narrow(dim, 0, count)) / size
     detail = images - mean

@@ -495,8 +495,8 @@ def _spectrum_figure(result: detection.DisplacementSpectrum) -> Figure:
         label_width = 0.09 * math.log(frequency[-1] / frequency[0])  # 9 % of the panel
         lines = result.lines.amplitude[axis].tolist(), result.lines.frequency[axis].tolist()
         for amplitude, at in zip(*lines, strict=True):  # the strongest first
-            apart = all(abs(math.log(at / other)) > label_width for other in labelled if at > 0)
-            if amplitude > SMALLEST_SHOWN * lines[0][0] and apart and len(labelled) < _LABELLED_LINES:
+            is_clear = all(abs(math.log(at / other)) > label_width for other in labelled if at > 0)
+            if amplitude > SMALLEST_SHOWN * lines[0][0] and is_clear and len(labelled) < _LABELLED_LINES:
                 text = f"{measured_text(at)} Hz\n{measured_text(amplitude, digits=3)} {unit}"
                 place = {"textcoords": "offset points", "fontsize": 8, "ha": "center"}
                 panels[0, axis].annotate(text, (at, amplitude), (0, 4), **place)

@@ -124,8 +124,8 @@ def motion_columns(result: MotionDetection, timing: SensorTiming) -> dict[str, l
     end = max(curve.end, float(result.times.max()) + timing.exposure_time)
     steps = math.ceil((end - curve.start) / (0.5 * curve.spacing))
     times = torch.linspace(curve.start, end, steps + 1, dtype=torch.float64, device=curve.device)
-    moved, at = curve.displacement(times).cpu().numpy(), times.cpu().numpy()
+    displacement, at = curve.displacement(times).cpu().numpy(), times.cpu().numpy()
     rows, stds = result.times.flatten().cpu(), result.std.flatten(0, 1).cpu()
-    columns = {"time": at, "x": moved[:, 0], "y": moved[:, 1]}
+    columns = {"time": at, "x": displacement[:, 0], "y": displacement[:, 1]}
     columns |= {f"std_{name}": np.interp(at, rows, stds[:, axis]) for axis, name in enumerate("xy")}
     return {name: [f"{v:.{9 if name == 'time' else 5}f}" for v in values] for name, values in columns.items()}

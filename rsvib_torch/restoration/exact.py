@@ -139,9 +139,9 @@ class FrameModel(MovingFrames):
         displacement, node_weights = self.motion.exposures
         shift = torch.as_tensor(scenes.shift[:, :, None, None], device=displacement.device)
         weights = self.weights[index] * torch.as_tensor(scenes.contributes, device=displacement.device)
-        moved = (displacement[index] - shift).flatten(0, 1)
+        displacements = (displacement[index] - shift).flatten(0, 1)
         height = self.images.shape[-2]
-        return RowKernels.of_rows(moved, node_weights, weights.flatten(), height, points=self.scale)
+        return RowKernels.of_rows(displacements, node_weights, weights.flatten(), height, points=self.scale)
 
     def strengths(self, scenes: Scenes) -> NDArray[np.float64]:
         """Factors (N,) on the priors: one for each stack, or strips of the same frames, estimated from its first scene.

@@ -346,13 +346,13 @@ def trusted_vibration(detected: DetectedVibration, timing: SensorTiming) -> tupl
     for stack, of_axes in enumerate(figures.view(-1, *figures.shape[-2:]).tolist()):
         reasons = detected.reasons[stack] if batched else detected.reasons
         where: dict[str, float | str] = {"action": "restored"} | ({"stack": stack} if batched else {})
-        for axis, (value, moved, is_reliable, is_accurate) in enumerate(of_axes):
+        for axis, (value, is_moving, is_reliable, is_accurate) in enumerate(of_axes):
             name = AXIS_NAMES[axis]
             if not is_reliable:
                 left_alone.append(Reason("axis_not_reliable", name, details=where | {"why": "; ".join(reasons[axis])}))
             elif not is_accurate:
-                details = where | {"size": moved, "unit": ("px", "px", "rad", "(zoom)")[axis]}
-                left_alone.append(Reason("axis_not_accurate", name, value, math.sqrt(0.5) * moved, details))
+                details = where | {"size": is_moving, "unit": ("px", "px", "rad", "(zoom)")[axis]}
+                left_alone.append(Reason("axis_not_accurate", name, value, math.sqrt(0.5) * is_moving, details))
     return vibration.scaled(reliable & accurate), tuple(left_alone)
 
 

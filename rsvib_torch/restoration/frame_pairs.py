@@ -33,8 +33,8 @@ def judged_columns(given: MovingFrames, restored: Tensor, count: int | None) -> 
     motion, (height, width) = given.motion, given.images.shape[-2:]
     if motion.vibration.same_for_all_columns:
         motion.check_fits(width)
-        apart = int(np.ptp(table(motion.shift)[..., 0], axis=1).max())
-        beside = 2 * (motion.displacement_bound() + 4 * _MARGIN) + apart
+        widest = int(np.ptp(table(motion.shift)[..., 0], axis=1).max())
+        beside = 2 * (motion.displacement_bound() + 4 * _MARGIN) + widest
         if count is None or count + beside >= width:
             return given, restored
         chosen = detailed_parts(given.images, count + beside)

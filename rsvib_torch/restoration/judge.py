@@ -204,9 +204,9 @@ def judge_stacks(
     # 3. The verdicts on all pairs of each stack.
     verdicts: list[RestorationVerdict | TooLittleInCommonError] = []
     for of_stack in np.arange(len(numbers)).reshape(-1, len(pairs)).tolist():
-        apart = [number for number in of_stack if number not in judged]
-        if apart:
-            (earlier, later), (down, right) = common.frames[apart[0]], common.step[apart[0]]
+        unjudged = [number for number in of_stack if number not in judged]
+        if unjudged:
+            (earlier, later), (down, right) = common.frames[unjudged[0]], common.step[unjudged[0]]
             height, width = given.images.shape[-2:]
             verdicts.append(
                 TooLittleInCommonError(
@@ -222,10 +222,10 @@ def judge_stacks(
 def _joined(pairs: list[PairVerdict], timing: SensorTiming) -> RestorationVerdict:
     """One verdict from those on all pairs of a stack, in image axes."""
     gains, displacements, outcomes, reasons = zip(*pairs, strict=True)
-    moved = torch.from_numpy(np.stack(displacements, 1))  # (3, P, 2)
-    moved = moved.flip(-1) if timing.scan_axis == -1 else moved
+    joined = torch.from_numpy(np.stack(displacements, 1))  # (3, P, 2)
+    joined = joined.flip(-1) if timing.scan_axis == -1 else joined
     return RestorationVerdict(
-        **dict(zip(DISPLACEMENTS, moved, strict=True)),
+        **dict(zip(DISPLACEMENTS, joined, strict=True)),
         predicted_gain=torch.tensor(gains, dtype=torch.float64, device="cpu"),
         outcome=outcomes,
         findings=tuple(reasons_from_row_order(of_pair, timing) for of_pair in reasons),
@@ -340,9 +340,9 @@ def _judge_pairs(given: MovingFrames, restored: Tensor, common: CommonParts, sha
         (pairs.later - pairs.predicted).square(),
         (pairs.predicted - pairs.restored) * pairs.changed_later,
     ]
-    moved = given.motion.mean_displacement[common.stack[:, None], common.frames].diff(dim=1)[:, 0]  # (N, R, 2)
+    displacement = given.motion.mean_displacement[common.stack[:, None], common.frames].diff(dim=1)[:, 0]  # (N, R, 2)
     means = [values.mean((1, 2, 3), dtype=torch.float64) for values in squares]
-    after, unexplained, change, *offset = table(torch.stack([*means, *moved.square().mean(1).sqrt().unbind(-1)]))
+    after, unexplained, change, *offset = table(torch.stack([*means, *displacement.square().mean(1).sqrt().unbind(-1)]))
 
     # 3. Error of the restored frames, from their difference and that of the later frame from its prediction, and of the
     # raw frames: the change of the scene by the motion, and noise.
@@ -353,9 +353,9 @@ def _judge_pairs(given: MovingFrames, restored: Tensor, common: CommonParts, sha
     # 4. The outcomes; a gain of the opposite sign is not stated.
     verdicts: list[PairVerdict] = []
     measured = zip(displacements.tolist(), np.stack(offset, 1).tolist(), gains.tolist(), strict=True)
-    for n, ((raw_misfit, rest, resolution), between, gain) in enumerate(measured):
+    for n, ((raw_misfit, remaining, resolution), between, gain) in enumerate(measured):
         moves = common.moves[n].tolist()
-        outcome, reasons = outcome_of_pair(raw_misfit, rest, resolution, moves, between, gain, one_image=single)
+        outcome, reasons = outcome_of_pair(raw_misfit, remaining, resolution, moves, between, gain, one_image=single)
         stated = outcome == "unknown" or (gain <= 0 if outcome == "worse" else gain >= 0)
         if pairs.missing[n] > _MAX_MISSING:
             outcome, reasons = "unknown", (Reason("pixels_missing", None, float(pairs.missing[n]), _MAX_MISSING),)

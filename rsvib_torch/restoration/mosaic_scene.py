@@ -73,14 +73,14 @@ def restore_mosaic(given: MovingFrames, colours: Tensor, options: ExactOptions) 
         for members, reference in groups:
             # 4. Colours are interpolated first if the frames of a scene do not determine them; this halves their noise.
             part = (linear[members], measured[members], None if floor is None else floor[members], level)
-            moved = displacement[stack, members] - motion.shift[stack, reference]
-            if len(members) == 1 or _same_colours(moved.detach(), node_weights):
+            displacements = displacement[stack, members] - motion.shift[stack, reference]
+            if len(members) == 1 or _same_colours(displacements.detach(), node_weights):
                 values, pattern = mosaic[members].expand_as(part[0]), measures(colours[stack][:1])[0]
                 filled = similar_patches(part[0], values, pattern, level, rounds=8, steps=6)
                 part = (filled, torch.ones_like(part[1]), None, level / 2)
             # 5. The observation operator, of three components of the scene, and the scene.
             of_frames, weight = motion.of([stack], members), frames.new_ones(3 * len(members))
-            kernels = RowKernels.of_rows(moved.repeat(3, 1, 1, 1), node_weights, weight, height, points=SCALE)
+            kernels = RowKernels.of_rows(displacements.repeat(3, 1, 1, 1), node_weights, weight, height, points=SCALE)
             observation = Observation(kernels, height, length, frames.dtype, 3)
             along = of_frames.shift[0, :, 0] - motion.shift[stack, reference, 0]
             images.append(_scene(*part, of_frames, observation, along, options))
@@ -138,8 +138,8 @@ def _scene(
         full = torch.where(known, images, predicted[:, :, 0, :, :width].transpose(0, 1) + mean)
         if count > 1:
             # the noise of the frames, and of the scene in its units: relative to white noise in place of the data
-            residual, left = ((colours - predicted) * measured).unbind(2)
-            residual_level = level * (residual.square().sum() / left.square().sum()).sqrt()
+            residual, unexplained = ((colours - predicted) * measured).unbind(2)
+            residual_level = level * (residual.square().sum() / unexplained.square().sum()).sqrt()
             gain = solver.image(coefficients)[:, 1].square().mean().sqrt() / level
             if options.noise == "auto":
                 level = residual_level.clamp(min=MIN_LEVEL)
@@ -264,8 +264,8 @@ def _similar(images: Tensor, starts: Tensor, places: Tensor, period: int) -> Ten
         distances = []
         for down, right in moves:
             top, left = _REACH + down, _REACH + right
-            moved = wide[..., top : top + part.shape[-2], left : left + width]
-            difference = (moved - part).square().sum(-3)
+            shifted = wide[..., top : top + part.shape[-2], left : left + width]
+            difference = (shifted - part).square().sum(-3)
             distance = functional.avg_pool2d(difference, _PATCH, stride=1)
             distances.append(distance[..., starts - begin, :][..., places].flatten(1))
         nearest = torch.stack(distances, -1).topk(_GROUP // period**2, dim=-1, largest=False).indices

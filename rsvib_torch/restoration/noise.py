@@ -153,9 +153,9 @@ def noise_of_frame_pair(frames: Tensor, motion: FrameMotion, ignore: Tensor | No
         measured_share = 1.0 - ignored.any(1).to(images.dtype).mean((1, 2, 3))
     stack, members = common.stack[:, None], common.frames
     displacement, node_weights = motion.exposures
-    moved = displacement[stack[..., None], members[..., None], tops[..., None] + np.arange(num_rows)]
-    moved = moved - motion.shift[stack, members][:, :, None, None]
-    noise = _residual_power(images, moved, node_weights) / measured_share
+    displacements = displacement[stack[..., None], members[..., None], tops[..., None] + np.arange(num_rows)]
+    displacements = displacements - motion.shift[stack, members][:, :, None, None]
+    noise = _residual_power(images, displacements, node_weights) / measured_share
     texture = (estimate_noise(images, ignored).square().mean((1, 2)) - noise).clamp(min=0.0)
     noise, known = noise[:, None], high_pass[common.stack]
     power = torch.maximum(known - texture[:, None], 0.5 * torch.minimum(known, noise))
@@ -171,15 +171,15 @@ def _residual_power(images: Tensor, displacement: Tensor, node_weights: Tensor) 
     exposures, in the coordinates of the scene.
     """
     num_rows, width = images.shape[-2:]
-    moved = displacement.flatten(0, 1)
-    kernels = RowKernels.of_rows(moved, node_weights, moved.new_ones(len(moved)), num_rows, margin=4 * _MIN_SIDE)
+    paths = displacement.flatten(0, 1)
+    kernels = RowKernels.of_rows(paths, node_weights, paths.new_ones(len(paths)), num_rows, margin=4 * _MIN_SIDE)
     count = min(24, width // 4)
     chosen = np.linspace(width // 4, width // 2, count, dtype=np.float32).astype(np.int64)
     # correlation 0.9 of neighbouring rows of the scene, of weight 1e-4 beside the data
     products = torch.tensor([[1.0, 0.9**2], [-0.9, 0.0]], dtype=torch.float64, device=images.device)
     precision = 1e-4 * products[:, :, None, None].expand(-1, -1, len(images), count)
-    power, rest = unexplained(images, kernels, chosen, precision)
-    return torch.as_tensor(power[0].sum(-1) / rest[0].sum(-1), dtype=images.dtype, device=images.device)
+    power, freedom = unexplained(images, kernels, chosen, precision)
+    return torch.as_tensor(power[0].sum(-1) / freedom[0].sum(-1), dtype=images.dtype, device=images.device)
 
 
 # Choice of the estimator
@@ -193,11 +193,11 @@ def noise_levels(frames: Tensor, motion: FrameMotion, ignore: Tensor | None = No
     frame without content, or with too few measured pixels, has the median noise power of the others. The frames (B, T,
     C, H, W) are in row order, with local means at pixels to ``ignore``.
     """
-    alone = valid_mean(np.square(noise_deviation(frames, ignore)), -1)
+    of_frames = valid_mean(np.square(noise_deviation(frames, ignore)), -1)
     low, high = tables(*frames[..., ::8, :].flatten(2).aminmax(dim=-1))
-    alone[high - low <= 1e-6 * np.maximum(-low, high)] = math.nan  # equal to within rounding: not even noise
-    high_pass = torch.as_tensor(alone, dtype=frames.dtype, device=frames.device)
+    of_frames[high - low <= 1e-6 * np.maximum(-low, high)] = math.nan  # equal to within rounding: not even noise
+    high_pass = torch.as_tensor(of_frames, dtype=frames.dtype, device=frames.device)
     estimated = table(noise_of_frame_pair(frames, motion, ignore, high_pass))
-    power = np.minimum(alone, without_nan(estimated, math.inf))
+    power = np.minimum(of_frames, without_nan(estimated, math.inf))
     power = without_nan(np.where(np.isnan(power), median(power, 1, keepdims=True), power), 0.0)
     return torch.as_tensor(np.sqrt(power), dtype=frames.dtype, device=frames.device)

@@ -351,14 +351,14 @@ class Observation:
         if order not in self._normal:
             kernels, points = self.kernels, self.kernels.points
             width = max(kernels.taps.shape[-2] - 1, points * order)
-            left = normal_matrices(kernels, self.top, self.count, width, self.dtype, self.num_scenes)
+            matrices = normal_matrices(kernels, self.top, self.count, width, self.dtype, self.num_scenes)
             bands = (
                 autoregressive_bands(self.count, order) if points == 1 else laplacian_bands(self.count // points, order)
             )
             beside = width - points * order
             prior = functional.pad(torch.from_numpy(bands), (0, 0, beside, beside, 0, width))
-            left, prior = (values.to(left.device, self.dtype).contiguous() for values in (left, prior))
-            self._normal[order] = SmoothBand(left, prior, points * order, 2 * kernels.blur_reach)
+            matrices, prior = (values.to(matrices.device, self.dtype).contiguous() for values in (matrices, prior))
+            self._normal[order] = SmoothBand(matrices, prior, points * order, 2 * kernels.blur_reach)
         return self._normal[order]
 
     def at_frequencies(self, u: Tensor, period: int) -> "Observation":
@@ -375,14 +375,14 @@ class Observation:
 
         The kernels, or their conjugates, are without the phase of the middle.
         """
-        left = self._at_nodes
+        at_nodes = self._at_nodes
         right = interpolation_matrix(self.kernels.blur_reach, self.u[part], self.dtype)[1]
         if conjugate:
             right[:, 1::2].neg_()
-        right = right.to(left)
-        count = at_once(left.element_size() * left.shape[1] * right.shape[1], left.device)
-        for taps in runs(len(left), count):
-            yield self._places[taps], torch.view_as_complex((left[taps] @ right).unflatten(-1, (-1, 2)))
+        right = right.to(at_nodes)
+        count = at_once(at_nodes.element_size() * at_nodes.shape[1] * right.shape[1], at_nodes.device)
+        for taps in runs(len(at_nodes), count):
+            yield self._places[taps], torch.view_as_complex((at_nodes[taps] @ right).unflatten(-1, (-1, 2)))
 
     def A(self, coefficients: Tensor) -> Tensor:  # noqa: N802 - name that solvers use
         """Noiseless frames ``K c`` (N, M, C, R, L) of scenes with coefficients (K, C, N, U)."""

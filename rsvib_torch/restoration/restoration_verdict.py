@@ -116,7 +116,7 @@ def outcome_of_pair(
     outcomes: list[tuple[Outcome, Reason | None]] = []
     motion_is_complete = True
     for axis, name in enumerate("xy"):
-        least, size, rest = max(resolution[axis], _FINEST), before[axis], after[axis]
+        least, size, remaining = max(resolution[axis], _FINEST), before[axis], after[axis]
         if not moves[axis]:
             motion_is_complete &= size <= least
             continue
@@ -125,17 +125,17 @@ def outcome_of_pair(
         details = {"before": size}
         if math.isinf(least):
             outcomes.append(("unknown", Reason("no_contrast", name)))
-        elif rest <= negligible and visible <= least:
+        elif remaining <= negligible and visible <= least:
             outcomes.append(("unknown", Reason("displaced_alike", name, visible, least)))
-        elif rest <= max(negligible, _PARTLY_RESIDUAL * size):
+        elif remaining <= max(negligible, _PARTLY_RESIDUAL * size):
             outcomes.append(("helps", None))
-        elif rest > _WORSE_RESIDUAL * size:
+        elif remaining > _WORSE_RESIDUAL * size:
             # less noise may outweigh a motion that was not undone, but not a motion that does not exist
             outweighed = size > least and gain > _GAIN_ERROR and not one_image
-            remains = Reason("motion_remains", name, rest, max(_WORSE_RESIDUAL * size, negligible), details)
+            remains = Reason("motion_remains", name, remaining, max(_WORSE_RESIDUAL * size, negligible), details)
             outcomes.append(("partly" if outweighed else "worse", remains))
         else:
-            remains = Reason("motion_remains", name, rest, max(_PARTLY_RESIDUAL * size, negligible), details)
+            remains = Reason("motion_remains", name, remaining, max(_PARTLY_RESIDUAL * size, negligible), details)
             outcomes.append(("partly", remains))
     if not outcomes:
         return "unknown", (Reason("nothing_undone"),)

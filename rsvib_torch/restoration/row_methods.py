@@ -47,12 +47,12 @@ def restore_dewarp(given: MovingFrames, options: DewarpOptions = DewarpOptions()
     """
     (B, T, _, H, W), dtype = given.images.shape, given.images.dtype
     length = extended_length(W, given.motion.displacement_bound())
-    taps, weights, moved = _found_rows(given.motion, dtype)
+    taps, weights, displacement = _shown_rows(given.motion, dtype)
     spectra = torch.view_as_real(spline_spectra(given.images, _DEWARP_DEGREE, length)).movedim(2, 3)
 
     def restored(part: slice) -> Tensor:
         """Some rows (B T, R, C, W) of all images."""
-        phases = shift_phases(moved[:, part], length, slice(0, length // 2 + 1), dtype.to_complex())
+        phases = shift_phases(displacement[:, part], length, slice(0, length // 2 + 1), dtype.to_complex())
         rows = _moved_back(spectra, taps[:, part], weights[:, part], torch.view_as_real(phases))
         return torch.fft.irfft(torch.view_as_complex(rows), n=length)[..., :W]
 
@@ -60,18 +60,18 @@ def restore_dewarp(given: MovingFrames, options: DewarpOptions = DewarpOptions()
     return torch.cat(parts, dim=1).unflatten(0, (B, T)).movedim(3, 2)
 
 
-def _found_rows(motion: FrameMotion, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+def _shown_rows(motion: FrameMotion, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
     """Rows (B T, H, 6) of frames from which those of restored frames are interpolated, their weights, and (B T, H) px.
 
     The last one is the mean displacement along the row at its place in the frame.
     """
-    rows, moved = motion.frame_rows(torch.arange(motion.num_rows, dtype=torch.float64, device=motion.shift.device))
+    rows, shift = motion.frame_rows(torch.arange(motion.num_rows, dtype=torch.float64, device=motion.shift.device))
     cell = rows.detach().floor()
     weights = bspline_weights(rows - cell, _DEWARP_DEGREE).to(dtype)
     first = -(_DEWARP_DEGREE // 2)
     offsets = torch.arange(first, first + _DEWARP_DEGREE + 1, device=rows.device)
     taps = mirrored(cell.to(torch.int64)[..., None] + offsets, motion.num_rows)
-    return taps.flatten(0, 1), weights.flatten(0, 1), moved[..., 0].flatten(0, 1)
+    return taps.flatten(0, 1), weights.flatten(0, 1), shift[..., 0].flatten(0, 1)
 
 
 def _moved_back(spectra: Tensor, taps: Tensor, weights: Tensor, phases: Tensor) -> Tensor:
@@ -118,7 +118,7 @@ class FixedDewarp(nn.Module):
         True
     """
 
-    taps: Tensor  # buffers, see ``_found_rows``
+    taps: Tensor  # buffers, see ``_shown_rows``
     weights: Tensor
     phases: Tensor  # (T, H, U, 2)
     to_coefficients: Tensor  # (H, H)
@@ -140,8 +140,8 @@ class FixedDewarp(nn.Module):
         motion.check_fits(width)
         self.timing, self.shape = timing, (num_frames, *sides)
         length = extended_length(width, motion.displacement_bound())
-        taps, weights, moved = _found_rows(motion, torch.float32)
-        phases = shift_phases(moved, length, slice(0, length // 2 + 1), torch.complex64)
+        taps, weights, displacement = _shown_rows(motion, torch.float32)
+        phases = shift_phases(displacement, length, slice(0, length // 2 + 1), torch.complex64)
         # Both transforms of unit vectors, in float64.
         units = torch.eye(width, dtype=torch.float64, device=motion.shift.device)
         of_rows = torch.view_as_real(torch.fft.rfft(extend_rows(units, length))).flatten(1)

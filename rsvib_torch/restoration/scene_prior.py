@@ -289,8 +289,8 @@ def unexplained(
     energy = channels * float((taper**2).sum())
     power = torch.einsum("smr,smcprf->psf", weight.to(residual.dtype), residual) / energy
     counted = (weight > 0).double().sum((1, 2))
-    unexplained_power, rest = tables(power, counted[:, None] - freedom)
-    return unexplained_power, rest
+    unexplained_power, freedom_left = tables(power, counted[:, None] - freedom)
+    return unexplained_power, freedom_left
 
 
 _STRENGTHS = np.array([1.0, 2.0, 4.0, 8.0, 16.0])  # factors on the prior
@@ -329,13 +329,13 @@ def prior_strengths(
     of_all = at.of(stacks.repeat(number), frames)
     strength = torch.from_numpy(_STRENGTHS.repeat(scenes)[:, None]).to(noise_power)
     precisions = of_all.precision(noise_power.repeat(number, 1), strength, blur_reach.repeat(number, 1))
-    power, rest = unexplained(images, kernels, chosen, precisions)
+    power, freedom = unexplained(images, kernels, chosen, precisions)
     # 2. ``n |r|^2 / (n - freedom)^2`` of Craven and Wahba (1979) estimates the squared error of predicting a pixel from
     # all others. The sum over the frequencies is dominated by those with the largest errors; the geometric mean gives
     # all the same weight. The weaker of the two selected priors is used: with the sum alone, five of 124 restorations
     # lose 0.2 to 2.8 dB; with the mean alone, ten of 98 with white noise lose 0.1 to 0.9 dB.
     with np.errstate(divide="ignore", invalid="ignore"):  # frames without content have no scores
-        of_sum = np.log(power.sum(-1)) - 2 * np.log(rest.sum(-1))
-        geometric = (np.log(power) - 2 * np.log(rest)).mean(-1)
+        of_sum = np.log(power.sum(-1)) - 2 * np.log(freedom.sum(-1))
+        geometric = (np.log(power) - 2 * np.log(freedom)).mean(-1)
     selected = [without_nan(score, math.inf).argmin(0) for score in (of_sum, geometric)]
     return _STRENGTHS[np.minimum(*selected)]

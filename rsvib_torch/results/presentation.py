@@ -65,9 +65,9 @@ def decode(kind: type[R], value: object, path: str) -> R:
             is_none = value[name] is None and types.NoneType in get_args(hint)
             values[name] = None if is_none else _decoded(hint, value[name], start + name, missing)
     try:
-        made = kind(**values)
-        check_fields(made)
-        return made
+        result = kind(**values)
+        check_fields(result)
+        return result
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: {error}" if path else str(error)) from error
 

@@ -155,8 +155,8 @@ def _with_tone(rows: _MeasuredRows, axis: int, tones: _Tones, nu: float, phi: fl
 
 def _peaks(rows: _MeasuredRows, axis: int, residual: Array, highest: float, count: int) -> list[tuple[float, float]]:
     """The strongest peaks (nu, phi) of the periodogram of the differences between neighbouring frames."""
-    seen = rows.measurements.visible[0]
-    weight = (rows.measurements.inverse_variances[0, :, axis, None] * seen[:, 1:] * seen[:, :-1]).ravel()
+    visible = rows.measurements.visible[0]
+    weight = (rows.measurements.inverse_variances[0, :, axis, None] * visible[:, 1:] * visible[:, :-1]).ravel()
     difference = np.diff(residual, axis=1).ravel()
     difference = difference - (weight * difference).sum() / max(weight.sum(), 1e-300)
     row, frame = rows.rows[0, :, :-1].ravel(), rows.frames[0, :, :-1].ravel()
@@ -292,8 +292,8 @@ def row_times_of_tones(
         possible = candidates(tones, clock)
         if not possible:
             return [], []
-        left = float(rows.measurements.unexplained(rows.residual(tones)).max())
-        if number > 1 and (all(map(_is_converged, before, tones)) or left > _HOPELESS):
+        unexplained = float(rows.measurements.unexplained(rows.residual(tones)).max())
+        if number > 1 and (all(map(_is_converged, before, tones)) or unexplained > _HOPELESS):
             break
 
     # 3. The row times that agree with the tones, and the verdict.

@@ -269,12 +269,12 @@ def _same_everywhere(profiles: Profiles, fit: BandFit, scene: SceneModel) -> boo
     parts = profiles.parts
     height = parts.shape[-1]
     periods = int(height / fit.period)
-    kept = round(periods * fit.period) if periods >= 2 else height
+    rows = round(periods * fit.period) if periods >= 2 else height
     if scene == "fixed":
         parts = parts - parts.mean(0) * (parts.mean(-1) / parts.mean((0, -1)))[..., None]
     else:
         parts = _less_parabola(parts)
-    phase = 2 * np.pi * np.arange(kept)
-    amplitude = parts[..., :kept] @ ((0.5 - 0.5 * np.cos(phase / kept)) * np.exp(-1j * phase / fit.period))
+    phase = 2 * np.pi * np.arange(rows)
+    amplitude = parts[..., :rows] @ ((0.5 - 0.5 * np.cos(phase / rows)) * np.exp(-1j * phase / fit.period))
     # bands of light have 0.97 and more, textures of photographs up to 0.95, of which most are below this
     return bool(np.abs(amplitude.sum(1)).sum() > 0.85 * np.abs(amplitude).sum())

@@ -102,19 +102,19 @@ class StackJob:
                 raise ValueError(next(iter(faults.values())))
             taken = torch.stack(list(images.values())).to(options.device)
             # 2. Their motion.
-            moved = self._motion(window, taken, window_timing(self.timing, window, list(images)))
-            tones = moved.tones
+            motion = self._motion(window, taken, window_timing(self.timing, window, list(images)))
+            tones = motion.tones
             record = replace(
                 record,
                 detection=None if tones is None else DetectedVibration.of(tones).to("cpu"),
-                motion=None if moved.free is None else moved.free.to("cpu"),
-                lost_before=None if moved.lost_before is None else window.first + moved.lost_before,
+                motion=None if motion.free is None else motion.free.to("cpu"),
+                lost_before=None if motion.lost_before is None else window.first + motion.lost_before,
             )
             # 3. The frames without it, and whether they are better.
             done = restore_trusted(
                 taken,
-                moved.timing,
-                moved.motion,
+                motion.timing,
+                motion.motion,
                 self._for_counts(taken),
                 force=options.force,
                 first_frames=len(kept) if len(kept) > 1 and not self.chosen.joint else None,

@@ -140,15 +140,15 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
         data, records = self.totals(), self.windows
         # 1. The vibration: the detection of the only window, or its tones over the windows.
         is_video = "video" in self.settings  # a hand may move its camera
-        alone = records[0].detection if len(records) == 1 and not self.is_removed else None
+        only_detection = records[0].detection if len(records) == 1 and not self.is_removed else None
         # all windows were measured, and nothing else than missing tones is stated against any axis
         is_still = not is_video and all(
             record.detection is not None
             and {reason.code for of_axis in record.detection.findings for reason in of_axis} == {"no_tone"}
             for record in records
         )
-        if alone is not None:
-            vibration = [alone.summary()]
+        if only_detection is not None:
+            vibration = [only_detection.summary()]
         elif is_still:
             text = "the camera stands still, or moves uniformly or by less than the noise"
             vibration = [wrapped(f"no window has a significant tone: {text}")]
@@ -161,9 +161,9 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
             gains = dict.fromkeys(f"{gain:+.1f}" for gain in data["predicted_gain_db"].values())
             restoration.append(f"estimated improvement {' … '.join(gains)} dB")
         restoration += self.doubts
-        for name, notes in data["left_alone"].items() if alone is not None or not is_still else ():
+        for name, notes in data["left_alone"].items() if only_detection is not None or not is_still else ():
             why = {window: note["text"] for window, note in notes.items()}
-            if alone is not None and any(note["code"] == "axis_not_reliable" for note in notes.values()):
+            if only_detection is not None and any(note["code"] == "axis_not_reliable" for note in notes.values()):
                 why = dict.fromkeys(notes, "its vibration is not reliable, see the reasons above")
             restoration += self._noted(f"{name} unchanged", why)
         for (before, after), where in zip(

@@ -81,14 +81,14 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
         records = folder.records()
         missing, resumed = [window for window in windows if window.index not in folder], len(records)
         # the finished windows and the output are on the disk together, until the output is complete
-        left, total = sum(window.kept for window in missing), job.info.shape[0]
-        stored = len(missing) if job.is_joined else left
+        remaining, total = sum(window.kept for window in missing), job.info.shape[0]
+        stored = len(missing) if job.is_joined else remaining
         stored += out.shape[0] if form.uncompressed else 0
         check_space(sink, stored * out.frame_bytes)
         # 3. The windows that are not in the folder: read, detected, restored, judged, stored.
         detection: DetectedVibration | None = None
         report = options.progress or (lambda done, total: None)
-        report(total - left, total)
+        report(total - remaining, total)
         share_one_heap()
         # Sums of floats depend on the number of threads: results must not depend on how many windows are computed.
         threads = torch.get_num_threads() if all(window.alone for window in missing) else 1
@@ -101,8 +101,8 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
                     folder.remove()
                     raise ValueError(records[0].error)
                 folder.add(record, frames)
-                left -= window.kept
-                report(total - left, total)
+                remaining -= window.kept
+                report(total - remaining, total)
         # 4. The output from the windows in the folder, and the manifest.
         with run.writing(folder, not_kept=metadata_not_kept(job.info, sink, out.shape)) as manifest:
             write_frames(form, sink, out, folder.frames())

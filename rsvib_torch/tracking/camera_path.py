@@ -135,9 +135,9 @@ def shake(corners: Corners) -> tuple[Array, float]:
         heavy = columns * weight[:, None, None]
         gram = np.einsum("nai,naj->ij", heavy, columns) + 1e-9 * np.eye(4)
         motion = np.linalg.solve(gram, np.einsum("nai,na->i", heavy, corners.offsets))
-        rest = corners.offsets - columns @ motion
-        length = np.hypot(*rest.T)
+        residual = corners.offsets - columns @ motion
+        length = np.hypot(*residual.T)
         weight = robust_weights(length, float(np.median(length)))
     part = np.where(corners.layer, (corners.rows * 12).astype(np.int64), -1)
-    bands = [np.median(rest[part == number], 0) for number in range(12) if (part == number).sum() > 4]
+    bands = [np.median(residual[part == number], 0) for number in range(12) if (part == number).sum() > 4]
     return motion[:2], float(np.sqrt(np.mean(np.square(bands)))) if bands else 0.0

@@ -65,8 +65,8 @@ class LivePath:
             pairs = ()
         else:
             tones = replace(removed.scaled(0.0), amplitude=removed.amplitude)
-            moved = tones.mean_displacement(tensor(corners.times - middle - 0.5 * exposure_time), exposure_time)
-            pairs = (*pairs, replace(corners, offsets=corners.offsets - np.diff(table(moved), axis=1)[:, 0]))[-_PAIRS:]
+            shift = tones.mean_displacement(tensor(corners.times - middle - 0.5 * exposure_time), exposure_time)
+            pairs = (*pairs, replace(corners, offsets=corners.offsets - np.diff(table(shift), axis=1)[:, 0]))[-_PAIRS:]
             longest = _LONGEST * self.timing.frame_period
             pairs = tuple(pair for pair in pairs if middle - pair.times.min() < longest)
         path = replace(

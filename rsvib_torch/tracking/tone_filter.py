@@ -89,18 +89,18 @@ class ToneFilter:
         """The filter at another time, with the process noise added, which may change in between if ``mixed``."""
         before, step = self._mixed() if mixed else self, time - self.time
         factor = np.exp(before.rates * step)
-        moved = before.coefficients * factor
+        coefficients = before.coefficients * factor
         eye = np.eye(self.values.shape[-1])
         transition = np.broadcast_to(eye, before.covariance.shape).copy()
         noise = np.zeros_like(transition)
         walk, jerk = np.moveaxis(np.square(np.array(PROCESS_NOISE))[..., None, None], 1, 0)  # (M, 1, 1)
         # Tones: C turns and grows by g and 2 pi f, whose random walk is integrated once.
-        for tone in range(moved.shape[-1]):
+        for tone in range(coefficients.shape[-1]):
             size, rate = slice(4 * tone, 4 * tone + 2), slice(4 * tone + 2, 4 * tone + 4)
-            by_rate = _as_matrix(moved[..., tone])  # derivative of C by the rate, per second
+            by_rate = _as_matrix(coefficients[..., tone])  # derivative of C by the rate, per second
             transition[..., size, size] = _as_matrix(factor[..., tone])
             transition[..., size, rate] = step * by_rate
-            exists = (np.abs(moved[..., tone]) > 0)[..., None, None] * walk
+            exists = (np.abs(coefficients[..., tone]) > 0)[..., None, None] * walk
             noise[..., size, size] = exists * (step**3 / 3) * (by_rate @ by_rate.mT)
             noise[..., size, rate] = exists * (step**2 / 2) * by_rate
             noise[..., rate, size] = noise[..., size, rate].mT
@@ -111,7 +111,7 @@ class ToneFilter:
         velocity, acceleration = np.moveaxis(before.drift, -1, 0)
         drift = np.stack([velocity + step * acceleration, acceleration], -1)
         covariance = transition @ before.covariance @ transition.mT + noise
-        return replace(before, time=time, values=_packed(moved, before.rates, drift), covariance=covariance)
+        return replace(before, time=time, values=_packed(coefficients, before.rates, drift), covariance=covariance)
 
     def _mixed(self) -> Self:
         """Every filter starts from the mean of all, weighted by how probable a change to its process noise is."""
@@ -128,8 +128,8 @@ class ToneFilter:
         # as products of matrices: einsum takes five times as many operations
         share = weight.mT
         mean = share @ self.values
-        apart = self.values[:, None] - mean[:, :, None]  # (A, N, M, P)
-        spread = (apart * share[..., None]).mT @ apart
+        deviation = self.values[:, None] - mean[:, :, None]  # (A, N, M, P)
+        spread = (deviation * share[..., None]).mT @ deviation
         size = self.covariance.shape[-1]
         covariance = split_axis(share @ self.covariance.reshape(*self.covariance.shape[:2], -1), -1, size, size)
         return mean, covariance + spread
@@ -220,13 +220,13 @@ class ToneFilter:
         for _ in range(2):
             weighted = columns * robust[..., None]
             solution = np.linalg.solve(weighted.mT @ columns + ridge, weighted.mT @ residual[..., None])
-            apart = (residual - (columns @ solution)[..., 0]) * np.sqrt(weights)
-            measured = np.where(weights > 0, np.abs(apart), np.nan)
+            scaled = (residual - (columns @ solution)[..., 0]) * np.sqrt(weights)
+            measured = np.where(weights > 0, np.abs(scaled), np.nan)
             spread = 1.4826 * np.maximum(without_nan(median(measured, -1, keepdims=True), 1.0), 1e-9)
-            share = np.square(np.maximum(1 - np.square(apart / (6 * spread)), 0.0))
+            share = np.square(np.maximum(1 - np.square(scaled / (6 * spread)), 0.0))
             robust = weights * share
         freedom = (share * (weights > 0)).sum(-1, keepdims=True) - columns.shape[-1]
-        variance = (share * np.square(apart)).sum(-1, keepdims=True) / np.maximum(freedom, 1.0)
+        variance = (share * np.square(scaled)).sum(-1, keepdims=True) / np.maximum(freedom, 1.0)
         return robust / np.maximum(variance, 1e-12)
 
     # Results

@@ -356,8 +356,8 @@ class VibrationTracker:
         """Whether tones, and the image motion over both frames, are smaller than a frame; not if they are NaN."""
         size, readout = max(frame.images.shape[-2:]), frame.images.shape[-2] * self._rows.row_time
         seconds = frame.time - track.start + readout
-        moved = np.abs(fit.drift) @ np.array([seconds, 0.5 * seconds**2])
-        is_small = bool((np.abs(fit.coefficients) < size).all() and (moved < size).all())
+        distance = np.abs(fit.drift) @ np.array([seconds, 0.5 * seconds**2])
+        is_small = bool((np.abs(fit.coefficients) < size).all() and (distance < size).all())
         return is_small and bool(np.isfinite(fit.frequencies).all() and np.isfinite(fit.covariance).all())
 
     def _predicted(self, state: _State) -> _State | None:

@@ -64,14 +64,14 @@ class _Wave:
 
 def _strongest_wave(fit: WindowFit, axis: int, readout: float) -> _Wave | None:
     """The wave of an axis that explains most beside the path, if it is significant."""
-    rest, (grid, _, is_visible), rate = copy(fit), fit.searched(readout), 1.0 / fit.interval
-    rest.tones = []
+    without_tones, (grid, _, is_visible), rate = copy(fit), fit.searched(readout), 1.0 / fit.interval
+    without_tones.tones = []
 
     def best(searched: Array, wanted: NDArray[np.bool_], parts: Array) -> list[tuple[float, float, float, float]]:
         """Sum of squares that a wave explains, its frequencies, and its ratio, for parts of the frame rate."""
         explained = []
         for part in parts:
-            wave, ratio, offsets = rest.strongest(axis, searched, wanted, turns=part * rate * readout)
+            wave, ratio, offsets = without_tones.strongest(axis, searched, wanted, turns=part * rate * readout)
             explained.append((offsets**2, wave, wave + part * rate, ratio))
         return explained
 
@@ -101,8 +101,8 @@ def _waves(fit: WindowFit, readout: float, is_explained: bool) -> list[_Wave]:
         return []
     waves = [wave for axis in (0, 1) if (wave := _strongest_wave(fit, axis, readout)) is not None]
     for tone in fit.tones:
-        apart = [(tone.frequency - wave.frequency) * fit.interval for wave in waves if wave.axis == tone.axis]
-        if all(abs(turns - round(turns)) > _SAME_WAVE for turns in apart):
+        differences = [(tone.frequency - wave.frequency) * fit.interval for wave in waves if wave.axis == tone.axis]
+        if all(abs(turns - round(turns)) > _SAME_WAVE for turns in differences):
             waves.append(_Wave(tone.axis, tone.frequency, tone.frequency))
     return waves
 
@@ -134,8 +134,8 @@ class _Readouts:
     def with_part(self, part: float, rounds: int) -> WindowFit:
         """The fit if rows take a part of the stated time."""
         fit = self.fit
-        moved = (1.0 - part) * self.readout * (fit.corners.rows - 0.5)
-        other = WindowFit(replace(fit.corners, times=fit.corners.times - moved[:, None]), fit.interval, fit.averaged)
+        delay = (1.0 - part) * self.readout * (fit.corners.rows - 0.5)
+        other = WindowFit(replace(fit.corners, times=fit.corners.times - delay[:, None]), fit.interval, fit.averaged)
         if part > 0.0:
             other.add_tones(sorted({(wave.axis, wave.alias(part, fit.interval)) for wave in self.waves}))
         other.layer, other.weights = fit.layer, fit.weights
@@ -174,19 +174,19 @@ def compared_readouts(fit: WindowFit, timing: SensorTiming, size: tuple[int, int
     rows, columns = (_Readouts(one, readout, _waves(one, readout, is_explained)) for one in fits)
     # 2. The best of them after one round, from the weights of the stated readout, must leave less in a robust fit. It
     # may do so by waves that have not been found as tones with the stated readout.
-    left = {(of, part): of.with_part(part, 1).unexplained for of in (rows, columns) for part in of.parts()}
-    of, part = min(left, key=lambda one: left[one])
+    unexplained = {(of, part): of.with_part(part, 1).unexplained for of in (rows, columns) for part in of.parts()}
+    of, part = min(unexplained, key=lambda one: unexplained[one])
     other = of.with_part(part, ROUNDS)
     least = (_CONTRADICTED if of.waves else _BY_PATH) * other.unexplained
     if least > fit.unexplained or least > rows.with_part(1.0, ROUNDS).unexplained:
         most = _AS_WELL * fit.unexplained if fit.tones else 0.0
-        agreeing = [part for (of, part), value in left.items() if of is rows and 0 < part != 1 and value < most]
+        agreeing = [part for (of, part), value in unexplained.items() if of is rows and 0 < part != 1 and value < most]
         of_agreeing = tuple(map(with_its_tones, sorted(agreeing, key=lambda one: abs(math.log(one)))))
         blur = blur_ratio(fit, timing, size) if fit.tones else (0.0, 0.0)
         return replace(fit.path(), blur=blur, agreeing=of_agreeing)
     # 3. Frames whose columns are read one after another are moved as a whole.
-    most = _CONTRADICTED * left[of, part]
-    as_good = sorted((value, one) for (its, one), value in left.items() if its is of is rows and value < most)
+    most = _CONTRADICTED * unexplained[of, part]
+    as_good = sorted((value, one) for (its, one), value in unexplained.items() if its is of is rows and value < most)
     names = " or ".join([*dict.fromkeys(name(one) for _, one in as_good)][:3]) or "column by column"
     other_readout = names, math.sqrt(fit.unexplained), math.sqrt(other.unexplained)
     return replace(other.path(), other_readout=other_readout, part=part if of is rows else 0.0)
@@ -228,8 +228,8 @@ def blur_ratio(fit: WindowFit, timing: SensorTiming, size: tuple[int, int]) -> t
     normal = np.add.reduceat(heavy[..., :3] @ columns.swapaxes(1, 2), starts)
     right = np.add.reduceat(heavy[..., 3:], starts)
     inner = normal[:, 2:, 2:] + 1e-9 * (np.trace(normal[:, 2:, 2:], axis1=1, axis2=2)[:, None, None] + 1e-9) * np.eye(3)
-    rest = np.concatenate([normal[:, :2, :2], right[:, :2]], 2)
-    of_pairs = rest - normal[:, :2, 2:] @ np.linalg.solve(inner, np.concatenate([normal[:, 2:, :2], right[:, 2:]], 2))
+    full = np.concatenate([normal[:, :2, :2], right[:, :2]], 2)
+    of_pairs = full - normal[:, :2, 2:] @ np.linalg.solve(inner, np.concatenate([normal[:, 2:, :2], right[:, 2:]], 2))
     total = of_pairs.sum(0)
     inverse = np.linalg.pinv(total[:, :2])
     solution = inverse @ total[:, 2]

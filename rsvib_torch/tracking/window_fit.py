@@ -142,9 +142,9 @@ class _Band:
     def stiffen(self, index: NDArray[np.int64], order: int, weight: float) -> None:
         """Keep the differences of some ``order`` between neighbouring unknowns, with rising numbers, small."""
         squares = _squared_differences(len(index), order)
-        for apart in range(order + 1):
-            later, earlier = index[apart:], index[: len(index) - apart]
-            self.matrix[later - earlier, earlier] += weight * squares.diagonal(apart)
+        for lag in range(order + 1):
+            later, earlier = index[lag:], index[: len(index) - lag]
+            self.matrix[later - earlier, earlier] += weight * squares.diagonal(lag)
 
     def solve(self) -> tuple[Array, Callable[[Array], Array]]:
         """The unknowns, and a function that solves for other right sides."""
@@ -296,11 +296,11 @@ class WindowFit:
         As long as other tones are not known, they hide which alias leaves less.
         """
         for tone in self.tones:
-            rest = copy(self)
-            rest.tones = [other for other in self.tones if other is not tone]
-            best, *others = rest.with_aliases(tone.axis, tone.frequency, tone.slope, limits)
+            without = copy(self)
+            without.tones = [other for other in self.tones if other is not tone]
+            best, *others = without.with_aliases(tone.axis, tone.frequency, tone.slope, limits)
             if others and others[0].unexplained < _DISTINCT * best.unexplained:
-                return rest
+                return without
             if abs(best.tones[-1].frequency - tone.frequency) * self.interval > 0.5:
                 return best
         return None
@@ -332,9 +332,9 @@ class WindowFit:
         parts = [of_side == third for of_side in thirds for third in range(3)]
         for tone, (early, late) in zip(self.tones, (wave.T for wave in waves), strict=True):
             columns = root[:, None] * np.stack([(late - early).real, (early - late).imag], -1)
-            left = root * residual[:, tone.axis]
-            tone.jump = self._jump(root, columns[:, 1], -0.5 * root * (early + late).imag, left)
-            fits = [np.linalg.lstsq(columns[part], left[part])[0] for part in parts]
+            weighted = root * residual[:, tone.axis]
+            tone.jump = self._jump(root, columns[:, 1], -0.5 * root * (early + late).imag, weighted)
+            fits = [np.linalg.lstsq(columns[part], weighted[part])[0] for part in parts]
             tone.apart = max(float(np.hypot(*solution)) for solution in fits)
 
         def is_kept(tone: WindowTone, wave: NDArray[np.complex128]) -> bool:
@@ -349,14 +349,14 @@ class WindowFit:
 
         self.tones = [tone for tone, wave in zip(self.tones, waves, strict=True) if is_kept(tone, wave)]
 
-    def _jump(self, root: Array, turned: Array, parted: Array, left: Array) -> float:
+    def _jump(self, root: Array, turned: Array, parted: Array, weighted: Array) -> float:
         """``WindowTone.jump``, from what is left of the offsets (N,), times the root of their weights.
 
         Offsets change by ``turned`` (N,) if the phase changes by 1 rad in both frames, and by ``parted`` (N,) if it
         does so between them. Beside these, a path of the pair is a polynomial over the rows.
         """
         polynomial = root[:, None] * (self.corners.rows[:, None] - 0.5) ** np.arange(4)
-        columns, largest = np.concatenate([polynomial, np.stack([turned, parted, left], -1)], 1), 0.0
+        columns, largest = np.concatenate([polynomial, np.stack([turned, parted, weighted], -1)], 1), 0.0
         for part, *_ in self.pairs:
             if (freedom := part.stop - part.start - 6) > 15:
                 triangle = np.asarray(np.linalg.qr(columns[part], "r"))
@@ -409,10 +409,10 @@ class WindowFit:
         # what vibrates most, and another alias of the tone would explain the rest better.
         order, sizes = np.lexsort((offsets, cell)), np.bincount(cell)
         middle = np.cumsum(sizes) - sizes + (sizes - 1) // 2
-        apart = np.abs(offsets - offsets[order[middle]][cell])
-        weights = self._weights(apart, 1.5 * float(np.median(apart)), 1.5 * self._medians(apart))
+        deviation = np.abs(offsets - offsets[order[middle]][cell])
+        weights = self._weights(deviation, 1.5 * float(np.median(deviation)), 1.5 * self._medians(deviation))
         total = np.maximum(np.bincount(cell, weights), 1e-9)
-        early, late, rest = (np.bincount(cell, weights * values) / total for values in (*self.times.T, offsets))
+        early, late, residual = (np.bincount(cell, weights * values) / total for values in (*self.times.T, offsets))
         times, root = np.stack([early, late], -1), np.sqrt(total)
         # 2. Project out what the path and the tones so far explain.
         taps = spline_taps(times + self.origin, self.start, self.step, self.count)
@@ -425,14 +425,14 @@ class WindowFit:
         gram[: self.count, : self.count] += _STIFFNESS * typical * _squared_differences(self.count, 3)
         gram[np.diag_indices(len(gram))] += _LEAST * typical
         factor = cho_factor(gram, lower=True)
-        rest = rest * root
-        rest = rest - known @ cho_solve(factor, known.T @ rest)
-        before = float(rest @ rest)
+        residual = residual * root
+        residual = residual - known @ cho_solve(factor, known.T @ residual)
+        before = float(residual @ residual)
         half = solve_triangular(factor[0], known.T, lower=True).astype(np.float32)
         # 3. What a tone of each frequency explains of the rest: the fit of a cosine and a sine. Waves are products of
         # those of a coarse and a fine grid of frequencies, in a tenth of the time of sines and cosines.
         fine = np.exp(2j * math.pi * (frequencies[1] - frequencies[0]) * np.arange(_FINE)[:, None, None] * times.T)
-        fine, single_rest, parts = fine.astype(np.complex64), rest.astype(np.float32), []
+        fine, single_rest, parts = fine.astype(np.complex64), residual.astype(np.float32), []
         of_rows = np.bincount(cell, weights * self.corners.rows) / total
         swept = root * np.exp(1j * math.pi * (slope * times.T**2 + 2 * turns * of_rows))
         for first in frequencies[::_FINE]:
@@ -453,7 +453,7 @@ class WindowFit:
         explained[1:-1] *= inner
         explained[[0, -1]] = 0.0
         best = int(explained.argmax())
-        freedom = max(len(rest) - len(gram) - 3, 1)
+        freedom = max(len(residual) - len(gram) - 3, 1)
         ratio = 0.5 * explained[best] / max((before - explained[best]) / freedom, 1e-12)
         return float(frequencies[best]), float(ratio), math.sqrt(explained[best] / float(total.sum()))
 

@@ -127,8 +127,8 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         motion = video_motion(frames, options, rates, camera, progress)
         margins = motion.margins() if border == "crop" else None
         if margins is not None:
-            kept = margins.cut(torch.empty(content.shape[-2:], device="meta")).shape
-            content = replace(content, shape=(*content.shape[:-2], *kept))
+            size = margins.cut(torch.empty(content.shape[-2:], device="meta")).shape
+            content = replace(content, shape=(*content.shape[:-2], *size))
         check_info_target(sink, content, parent_exists=False)
         _SecondPass(motion, folder, content, margins, progress).run(at_once)
         parts = range(-(-len(frames.starts) // PART_FRAMES))

@@ -48,8 +48,8 @@ class RecordedRotation:
         middles = tensor(times)
         before = torch.searchsorted(of_camera.times, middles, right=True) - 1
         samples = Rotation.from_rotvec(table(of_camera.attitude(float(times[0]))[before]))
-        rest = Rotation.from_rotvec(table(of_camera.rotation(of_camera.times[before], middles)))
-        return cls(of_camera, alignment.motion.camera or Camera(alignment.focal_length), times, samples * rest)
+        within = Rotation.from_rotvec(table(of_camera.rotation(of_camera.times[before], middles)))
+        return cls(of_camera, alignment.motion.camera or Camera(alignment.focal_length), times, samples * within)
 
     @cached_property
     def _axes(self) -> Rotation:
@@ -83,8 +83,8 @@ class RecordedRotation:
         times = np.arange(-2 * samples, 2 * samples + 1) / (2 * self.rates.sample_rate)
         middle = torch.full((len(times),), self.times[number], dtype=torch.float64)
         within = Rotation.from_rotvec(table(self.rates.rotation(middle, middle + tensor(times))))
-        moved = Rotation.from_rotvec(table(self.camera.attitude(tensor(shift[:3])))) * within
-        return FreeMotion.through(times, self._components(moved), camera=self.camera)
+        turned = Rotation.from_rotvec(table(self.camera.attitude(tensor(shift[:3])))) * within
+        return FreeMotion.through(times, self._components(turned), camera=self.camera)
 
     def _components(self, rotations: Rotation) -> Array:
         """(n, 3) X, Y (px) and roll (rad) of rotations, see ``Camera``."""

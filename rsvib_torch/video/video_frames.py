@@ -113,10 +113,10 @@ class VideoFrames:
         if self.job.chosen.method != "dewarp" and isinstance(motion, Vibration) and bool((motion.amplitude > 0).any()):
             # The method undoes what varies between the rows along x and y, and the rest is moved afterwards.
             luma = self._without_vibration(luma, timing, replace(motion.translation(), image_shift=torch.zeros(2)))
-            rest = {name: getattr(motion, name).clone() for name in ("image_motion", "image_acceleration")}
-            for values in rest.values():
+            remaining = {name: getattr(motion, name).clone() for name in ("image_motion", "image_acceleration")}
+            for values in remaining.values():
                 values[:2] = 0.0
-            motion = replace(motion, amplitude=torch.zeros_like(motion.amplitude), **rest)
+            motion = replace(motion, amplitude=torch.zeros_like(motion.amplitude), **remaining)
             source = places(*recorded_offsets(motion, timing, self.size), timing, self.size)
         return [_with_pixels_moved(luma, source), *chroma]
 
@@ -152,8 +152,8 @@ def _with_pixels_moved(plane: Frame, source: NDArray[np.float32]) -> Frame:
     stored = plane if plane.dtype in (np.uint8, np.uint16, np.float32) else plane.astype(np.float32)
     x, y = np.ascontiguousarray(source[0]), np.ascontiguousarray(source[1])
     flat = stored.reshape(-1, *stored.shape[-2:])
-    moved = np.stack([cv2.remap(one, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101) for one in flat])
-    if moved.dtype != plane.dtype and plane.dtype.kind in "iu":
+    interpolated = np.stack([cv2.remap(one, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101) for one in flat])
+    if interpolated.dtype != plane.dtype and plane.dtype.kind in "iu":
         limits = np.iinfo(plane.dtype)
-        moved = np.clip(np.rint(moved), limits.min, limits.max)
-    return moved.reshape(plane.shape).astype(plane.dtype, copy=False)
+        interpolated = np.clip(np.rint(interpolated), limits.min, limits.max)
+    return interpolated.reshape(plane.shape).astype(plane.dtype, copy=False)

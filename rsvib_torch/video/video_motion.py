@@ -183,13 +183,13 @@ class VideoMotion:
             raw = self.found.corners.get(pair[0].index)
             if raw is not None:
                 both = shake(raw), shake(self._restored_corners(pair, raw))
-                measured[pair[0].index] = np.array([[*moved, rows] for moved, rows in both])
+                measured[pair[0].index] = np.array([[*steps, rows] for steps, rows in both])
         changes = [measured[index + 1] - measured[index] for index in measured if index + 1 in measured]
         if not changes:
             return None
-        moved, rows = np.array(changes)[..., :2], np.array(list(measured.values()))[..., 2]
+        steps, rows = np.array(changes)[..., :2], np.array(list(measured.values()))[..., 2]
         return {
-            "frame_to_frame": tuple(np.sqrt(np.square(moved).sum(-1).mean(0)).tolist()),
+            "frame_to_frame": tuple(np.sqrt(np.square(steps).sum(-1).mean(0)).tolist()),
             "rows": tuple(np.sqrt(np.square(rows).mean(0)).tolist()),
         }
 
@@ -210,16 +210,16 @@ class VideoMotion:
         detection = None
         if isinstance(path, CameraPath):
             detection = part_detection(self.frames, path, self.found.taken, slice(first, last + 1))
-        left = []
+        reasons = []
         if detection is not None and not self.is_steady:  # the rows of axes without tones are not moved
-            left = [
+            reasons = [
                 Reason("axis_not_reliable", name, details={"action": "restored", "why": "; ".join(map(str, why))})
                 for name, why, sizes in zip(
                     AXIS_NAMES[:2], detection.reasons, detection.vibration.amplitude, strict=True
                 )
                 if not sizes.any()
             ]
-        moved = any(bool(track.motion.moving_axes().any()) for track in tracks if track.fault is None)
+        is_moved = any(bool(track.motion.moving_axes().any()) for track in tracks if track.fault is None)
         helps = shaking is not None and any(after < before for before, after in shaking.values())
         outcome = "worse" if part.is_worse else "helps" if helps else None
         return WindowRecord(
@@ -228,12 +228,12 @@ class VideoMotion:
             last=last,
             start_time=float(self.frames.starts[first]),
             written=len(tracks),
-            frames="restored" if moved else "as taken",
+            frames="restored" if is_moved else "as taken",
             detection=detection,
             outcome=outcome,
             verdict="restored rows would shake more than those taken, and are left as taken" if part.is_worse else None,
             bad_frames={str(track.index): track.fault for track in tracks if track.fault is not None},
-            left_alone=tuple(left),  # tones are removed as they were measured, whatever explains them
+            left_alone=tuple(reasons),  # tones are removed as they were measured, whatever explains them
             shaking=shaking,
         )
 

@@ -348,10 +348,10 @@ def _rms_of_contrasts(
     for of_group in gradients:
         residual, noise, regular = displacements_of_parts(of_group, len(weights[0]))
         contrasts = residual.new_tensor(weights)
-        variance, moved = contrasts.square() @ noise, contrasts @ residual
-        if not uniform and moved.shape[1] > 2:  # roll within the frame looks uniform in fewer sums of rows
-            moved = moved - moved.where(regular[..., None, None], torch.nan).nanmedian(1, keepdim=True).values
-        excess = (moved.square() - variance).sum(2)
+        variance, values = contrasts.square() @ noise, contrasts @ residual
+        if not uniform and values.shape[1] > 2:  # roll within the frame looks uniform in fewer sums of rows
+            values = values - values.where(regular[..., None, None], torch.nan).nanmedian(1, keepdim=True).values
+        excess = (values.square() - variance).sum(2)
         both = torch.cat([excess, 2 * variance.square().sum(2)], -1)  # and the variance of the excess
         both = torch.where(regular[..., None], both, torch.nan)
         of_groups.append(_of_stacks(both, len(both) // stacks))

@@ -44,23 +44,23 @@ class SplineFit:
 
     def std_of_visible(self, measured: Measurements) -> tuple[Array, Array]:
         """(A,) px, rms standard deviations of scene rows less their mean over the frames, and of this mean."""
-        seen = measured.visible[0]
-        several = seen.sum(-1) > 1
-        seen, times = seen[several], measured.exposure_starts[0][several] + 0.5 * measured.exposure_time
-        first = np.where(seen > 0, times, np.inf).min(1, keepdims=True)
-        times, count = np.where(seen > 0, times, first), self.coefficients.shape[-1]
+        visible = measured.visible[0]
+        several = visible.sum(-1) > 1
+        visible, times = visible[several], measured.exposure_starts[0][several] + 0.5 * measured.exposure_time
+        first = np.where(visible > 0, times, np.inf).min(1, keepdims=True)
+        times, count = np.where(visible > 0, times, first), self.coefficients.shape[-1]
         index, weights = spline_taps(times, self.start, self.spacing, count)
         sums = np.zeros((2, len(self.coefficients)))
-        for part in runs(len(seen), 256):  # (256, G, 4 G, 4 G) at a time
-            frames = seen[part].shape[1]
+        for part in runs(len(visible), 256):  # (256, G, 4 G, 4 G) at a time
+            frames = visible[part].shape[1]
             of_frames = np.eye(frames)[:, :, None] * weights[part, None]  # (n, G, G, 4)
             of_frames = of_frames.reshape(-1, frames, 4 * frames)
-            share = seen[part] / seen[part].sum(1, keepdims=True)
+            share = visible[part] / visible[part].sum(1, keepdims=True)
             mean = (share[:, :, None] * of_frames).sum(1, keepdims=True)
             indices = index[part].reshape(-1, 4 * frames)
-            of_visible = self._variances(indices, of_frames - mean) * seen[part, :, None]
+            of_visible = self._variances(indices, of_frames - mean) * visible[part, :, None]
             sums += np.stack([values.sum((0, 1)) for values in (of_visible, self._variances(indices, mean))])
-        return np.sqrt(sums[0] / seen.sum()), np.sqrt(sums[1] / len(seen))
+        return np.sqrt(sums[0] / visible.sum()), np.sqrt(sums[1] / len(visible))
 
     def _variances(self, index: Array, weights: Array) -> Array:
         """Variances (S, F, A) of sums of ``weights`` (S, F, M) times coefficients ``index`` (S, M)."""
@@ -81,7 +81,7 @@ def fit_spline(
     """
     first, last = record
     count = math.ceil((last - first) / spacing) + 3
-    seen, exposure_time, mean = measurements.visible[0], measurements.exposure_time, None
+    visible, exposure_time, mean = measurements.visible[0], measurements.exposure_time, None
     if report_times is not None:
         index, weights = spline_taps(report_times, first, spacing, count)
         mean = np.bincount(index.ravel(), weights.ravel(), count) / len(report_times)
@@ -92,12 +92,12 @@ def fit_spline(
         nodes, shares = (table(values) for values in gauss_legendre(3 + math.ceil(2 * average / spacing)))
         begin = measurements.exposure_starts[0] + 0.5 * (exposure_time - average)
         index, weights = spline_taps(begin[..., None] + average * nodes, first, spacing, count)  # (R, G, Q, 4)
-        index, weights = index.reshape(*seen.shape, -1), (shares[:, None] * weights).reshape(*seen.shape, -1)
+        index, weights = index.reshape(*visible.shape, -1), (shares[:, None] * weights).reshape(*visible.shape, -1)
         # 2. The normal equations.
-        values, of_rows = measurements.displacements[0, ..., axis] * seen, measurements.inverse_variances[0, :, axis]
+        values, of_rows = measurements.displacements[0, ..., axis] * visible, measurements.inverse_variances[0, :, axis]
         weighted, energy = of_rows[:, None] * values, float((of_rows[:, None] * np.square(values)).sum())
         right = np.bincount(index.ravel(), (weights * weighted[..., None]).ravel(), count)
-        band = _normal_band(index, weights, seen, of_rows, count)
+        band = _normal_band(index, weights, visible, of_rows, count)
         # 3. Their solution.
         known = max(float(measurements.num_measurements[0, axis]), 1.0)
         value, covariance = _solved_spline(band, right, energy, known, mean)
@@ -106,20 +106,20 @@ def fit_spline(
     return SplineFit(np.stack(coefficients), first, spacing, covariances)
 
 
-def _normal_band(index: Array, weights: Array, seen: Array, row_weights: Array, count: int) -> Array:
+def _normal_band(index: Array, weights: Array, visible: Array, row_weights: Array, count: int) -> Array:
     """Lower band (D, N) of the normal matrix of N = ``count`` coefficients for values relative to their group.
 
-    The value of a row in a frame depends on the coefficients ``index`` (R, G, M) by the factors ``weights``. ``seen``
-    (R, G) is 1 where a frame contains the row, else 0; ``row_weights`` (R,) are those of the rows.
+    The value of a row in a frame depends on the coefficients ``index`` (R, G, M) by the factors ``weights``;
+    ``visible`` (R, G) is 1 where a frame contains the row, else 0; ``row_weights`` (R,) are those of the rows.
     """
-    number, frames = seen.shape
-    value = np.arange(seen.size)
+    number, frames = visible.shape
+    value = np.arange(visible.size)
     # 1. Values of the rows in all frames as functions of the coefficients, less their mean over the frames.
     places = (value.repeat(index.shape[-1]), index.ravel())
-    values = sparse.csr_array(((weights * seen[..., None]).ravel(), places), shape=(seen.size, count))
+    values = sparse.csr_array(((weights * visible[..., None]).ravel(), places), shape=(visible.size, count))
     values.eliminate_zeros()
-    of_rows = sparse.csr_array((seen.ravel(), (value, value // frames)), shape=(seen.size, number))
-    mean = sparse.diags_array(1 / np.maximum(seen.sum(1), 1.0)) @ (of_rows.T @ values)
+    of_rows = sparse.csr_array((visible.ravel(), (value, value // frames)), shape=(visible.size, number))
+    mean = sparse.diags_array(1 / np.maximum(visible.sum(1), 1.0)) @ (of_rows.T @ values)
     relative = values - of_rows @ mean
     # 2. The weighted products of the columns.
     normal = (relative.T @ sparse.diags_array(row_weights.repeat(frames)) @ relative).tocoo()

@@ -71,11 +71,11 @@ class ToneFit:
 
     def about(self, centre: Array) -> "ToneFit":
         """The same motion with another centre (B,) in s; only the covariance is not changed."""
-        moved = (centre - self.centre)[:, None]
-        turn = 2 * math.pi * self.frequencies * moved[..., None]
+        shift = (centre - self.centre)[:, None]
+        turn = 2 * math.pi * self.frequencies * shift[..., None]
         drift = self.drift
         if drift.shape[-1] > 1:  # the constant of (s + moved)^2 / 2 cancels within the group
-            drift = np.stack([drift[..., 0] + drift[..., 1] * moved, drift[..., 1]], -1)
+            drift = np.stack([drift[..., 0] + drift[..., 1] * shift, drift[..., 1]], -1)
         turned = self.coefficients * unit_wave(turn)
         return replace(self, coefficients=turned, drift=drift, centre=centre)
 

@@ -30,9 +30,9 @@ def _power(measurements: Measurements, grid: tuple[float, int, int], weights: Ar
     ``(R - Re Q) / 2``, and their product is ``Im Q / 2``, with ``Q = sum_g E_g^2 - A^2 / n`` and ``R = n - |A|^2 / n``.
     """
     # 1. Weights of rows and frames, and the normal equations of the image motion.
-    seen, time = measurements.visible, measurements.middles[..., 0, 0]
+    visible, time = measurements.visible, measurements.middles[..., 0, 0]
     of_rows = weights.swapaxes(2, 3)  # (B, S, A, N)
-    frame_weights = of_rows[..., None] * seen[:, None, None]  # (B, S, A, N, G)
+    frame_weights = of_rows[..., None] * visible[:, None, None]  # (B, S, A, N, G)
     drift = measurements.drifts[:, None, None, :, :, 0, 0]
     values = np.moveaxis(measurements.displacements, -1, 1)[:, None]  # (B, 1, A, N, G)
     of_drift = frame_weights * drift
@@ -46,12 +46,12 @@ def _power(measurements: Measurements, grid: tuple[float, int, int], weights: Ar
     frequencies = step * np.arange(first, first + count)
     attenuation = np.sinc(frequencies * measurements.smearing_times[:, 0]).prod(0)  # (A, F)
     earlier, later = np.triu_indices(time.shape[2])
-    share = seen[..., earlier] * seen[..., later] / np.maximum(seen.sum(2, keepdims=True), 1.0)
-    of_squares = np.where(earlier == later, seen[..., earlier] - share, -2 * share)
+    share = visible[..., earlier] * visible[..., later] / np.maximum(visible.sum(2, keepdims=True), 1.0)
+    of_squares = np.where(earlier == later, visible[..., earlier] - share, -2 * share)
     Q = fourier_sums(time[..., earlier] + time[..., later], of_rows[..., None] * of_squares[:, None, None], grid)
-    apart = earlier != later
-    of_moduli = of_rows[..., None] * (2 * share[..., apart])[:, None, None]
-    R = most - fourier_sums(time[..., later[apart]] - time[..., earlier[apart]], of_moduli, grid).real
+    differs = earlier != later
+    of_moduli = of_rows[..., None] * (2 * share[..., differs])[:, None, None]
+    R = most - fourier_sums(time[..., later[differs]] - time[..., earlier[differs]], of_moduli, grid).real
     Q, R = Q * np.square(attenuation), R * np.square(attenuation)
 
     # 3. Products of the waves with the image motion and with the displacements.
