@@ -113,14 +113,14 @@ def check_pixels(name: str, pixels: Tensor) -> None:
 
 def check_broadcast(**tensors: object) -> None:
     """Raise a ``ValueError`` unless tensors broadcast; other values are omitted."""
-    given = {name: value for name, value in tensors.items() if isinstance(value, Tensor)}
-    if len(given) < 2:
+    present = {name: value for name, value in tensors.items() if isinstance(value, Tensor)}
+    if len(present) < 2:
         return
     try:
-        torch.broadcast_tensors(*given.values())  # torch.broadcast_shapes takes 40 us, and its first call imports sympy
+        torch.broadcast_tensors(*present.values())  # torch.broadcast_shapes takes 40 us, and first imports sympy
     except RuntimeError as error:
-        shapes = ", ".join(str(tuple(value.shape)) for value in given.values())
-        raise ValueError(f"{' and '.join(given)} do not fit together: {shapes}") from error
+        shapes = ", ".join(str(tuple(value.shape)) for value in present.values())
+        raise ValueError(f"{' and '.join(present)} do not fit together: {shapes}") from error
 
 
 def check_device(name: str, value: object) -> torch.device:
@@ -171,22 +171,22 @@ def checked_methods(kind: type[R]) -> type[R]:
 def check_fields(value: Any) -> None:
     """Check the fields of a dataclass against their annotations; lists become tuples, tables and tensors are copied."""
     kinds = hints_of(value.__class__)
-    for name, given in tuple(vars(value).items()):
-        checked = _checked(name, given, kinds[name], finite=False)
+    for name, content in tuple(vars(value).items()):
+        checked = _checked(name, content, kinds[name], finite=False)
         checked = checked.clone() if isinstance(checked, Tensor) else checked
-        if isinstance(checked, (tuple, dict, Tensor)) and not isinstance(given, tuple):
+        if isinstance(checked, (tuple, dict, Tensor)) and not isinstance(content, tuple):
             object.__setattr__(value, name, checked)
 
 
 @cache
 def hints_of(owner: Callable[..., object]) -> dict[str, object]:
     """Annotations of the arguments of a function, or of the fields of a class."""
-    given = {name: kind for name, kind in owner.__annotations__.items() if name != "return"}
+    annotations = {name: kind for name, kind in owner.__annotations__.items() if name != "return"}
     if isinstance(owner, type):
         return get_type_hints(owner, localns={"Tensor": Tensor}, include_extras=True)
     names = inspect.unwrap(owner).__globals__
-    known = {"Tensor": Tensor, "torch": torch}
-    return get_type_hints(types.SimpleNamespace(__annotations__=given), names, known, include_extras=True)
+    namespace = {"Tensor": Tensor, "torch": torch}
+    return get_type_hints(types.SimpleNamespace(__annotations__=annotations), names, namespace, include_extras=True)
 
 
 def _checked(name: str, value: object, kind: object, *, finite: bool = True) -> object:

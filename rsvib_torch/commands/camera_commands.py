@@ -44,16 +44,16 @@ class InitOptions:
     """Replace an existing configuration file."""
 
 
-def init(given: InitOptions) -> Answer:
+def init(command: InitOptions) -> Answer:
     """Write a configuration file for the camera of a stack of frames.
 
     What the file does not state is taken from the options; an error explains where to find what is missing.
     """
-    frames, out = given.frames, given.out
-    if given.camera is not None and "row_time" in given.sensor:
+    frames, out = command.frames, command.out
+    if command.camera is not None and "row_time" in command.sensor:
         raise ValueError("--camera and --row-time both state the row time; give one of them")
-    shared.check_file(out, given.overwrite, io.stack_files(frames))
-    text = _describe_camera(frames, given.sensor, given.camera)
+    shared.check_file(out, command.overwrite, io.stack_files(frames))
+    text = _describe_camera(frames, command.sensor, command.camera)
     with whole(out) as file:
         file.write_text(text, encoding="utf-8")
     return Answer({}, {}, [out], [answers.run_step(frames, Path("results"), ["--config", str(out)])])
@@ -67,13 +67,13 @@ class CamerasOptions:
     """Words of its name, e.g. iphone 12."""
 
 
-def cameras(given: CamerasOptions) -> Answer:
+def cameras(command: CamerasOptions) -> Answer:
     """List camera models with known row times.
 
     A line for each mode whose readout time is known: median and spread of calibrations by users of Gyroflow (CC0
     1.0). rsvib init --camera NAME takes the row time.
     """
-    modes = find_cameras(" ".join(given.search or ()))
+    modes = find_cameras(" ".join(command.search or ()))
     head = ("brand", "model", "view", "width x height", "fps", "readout (ms)", "row time (us)", "entries")
     rows = []
     for mode in modes:
@@ -96,7 +96,7 @@ def _row_time_of(camera: str, info: "StackInfo", values: Table) -> tuple[dict[st
     return sensor, f"row time {time} us, from gyroflow/lens_profiles: {mode}"
 
 
-def _describe_camera(path: Path, given: Table, camera: str | None) -> str:
+def _describe_camera(path: Path, sensor: Table, camera: str | None) -> str:
     """Text of the configuration file: values of the command line and of the file of the frames."""
     with working(f"reading {path}"):
         info = io.read_stack_info(path)
@@ -105,19 +105,19 @@ def _describe_camera(path: Path, given: Table, camera: str | None) -> str:
     frames = f"{number_of(info.shape[0], 'frame')} of {of}{info.shape[-2]} x {info.shape[-1]} px"
     size = f"{frames} (height x width), {info.dtype}"
     note(f"{path}: {size}")
-    values, rows = dict(given), info.shape[-1 if given.get("scan_axis") == "x" else -2]
-    stated = io.stated_rate(info)
-    if stated is not None and "frame_rate" not in given:
-        values["frame_rate"] = stated
-        note(f"frame rate {stated:.6g} per second, from the times in the file")
-    elif stated is not None and not math.isclose(stated, given["frame_rate"], rel_tol=0.01):
-        warn(f"--frame-rate is {given['frame_rate']:g}, the times in the file give {stated:.6g}")
+    values, rows = dict(sensor), info.shape[-1 if sensor.get("scan_axis") == "x" else -2]
+    rate_of_file = io.stated_rate(info)
+    if rate_of_file is not None and "frame_rate" not in sensor:
+        values["frame_rate"] = rate_of_file
+        note(f"frame rate {rate_of_file:.6g} per second, from the times in the file")
+    elif rate_of_file is not None and not math.isclose(rate_of_file, sensor["frame_rate"], rel_tol=0.01):
+        warn(f"--frame-rate is {sensor['frame_rate']:g}, the times in the file give {rate_of_file:.6g}")
     source, proposal = None, ""
     if camera is not None:
-        known, source = _row_time_of(camera, info, values)
-        values |= known
+        row_time, source = _row_time_of(camera, info, values)
+        values |= row_time
         note(source)
-    elif info.camera is not None and "row_time" not in given:
+    elif info.camera is not None and "row_time" not in sensor:
         try:
             _, proposed = _row_time_of(info.camera, info, values)
             proposal = f' The file names its camera: --camera "{info.camera}" takes {proposed}.'
@@ -225,16 +225,16 @@ class CalibrateOptions:
     """Replace results that exist already."""
 
 
-def calibrate(given: CalibrateOptions) -> Answer:
+def calibrate(command: CalibrateOptions) -> Answer:
     """Measure the row time with a flickering light, or row time and readout direction with motion.
 
     With --by-motion, a row time that is not certain is refused with the
     reason.
     """
     # 1. The frames, and what is known of them.
-    paths, out = given.frames, given.out
+    paths, out = command.frames, command.out
     if out is not None:
-        shared.check_file(out, given.overwrite, [file for path in paths for file in io.stack_files(path)])
+        shared.check_file(out, command.overwrite, [file for path in paths for file in io.stack_files(path)])
     infos = [io.read_stack_info(path) for path in paths]
     if io.split_range(paths[0])[1] is None and infos[0].shape[0] > _CALIBRATED_FRAMES:
         note(f"the first {_CALIBRATED_FRAMES} of {infos[0].shape[0]} frames are used; NAME[START:END] are others")
@@ -242,21 +242,21 @@ def calibrate(given: CalibrateOptions) -> Answer:
         infos = [io.read_stack_info(paths[0])]
     for sentence in (sentence for info in infos for sentence in io.describe_stack(info, None)):
         note(sentence)
-    known = _known_of(given, paths[0])
+    known = _known_of(command, paths[0])
     # 2. The row time.
     with working("reading the frames"):
-        stack = io.read_stack(paths, full_scale=given.full_scale)
-    measure = row_time.calibrate_row_time_by_motion if given.by_motion else row_time.calibrate_row_time
-    with working("measuring the motion" if given.by_motion else "measuring the flicker"):
+        stack = io.read_stack(paths, full_scale=command.full_scale)
+    measure = row_time.calibrate_row_time_by_motion if command.by_motion else row_time.calibrate_row_time
+    with working("measuring the motion" if command.by_motion else "measuring the flicker"):
         result = measure(stack, **known)
     if result.row_time is None or result.row_time_std is None or not result.reliable:
         raise ValueError(f"the row time is not certain: {'; '.join(result.reasons)}")
     # 3. The configuration file, in which unknown values are comments.
     values: Table = {"row_time": result.row_time, "row_time_std": result.row_time_std}
-    values["exposure_time"] = given.exposure_time
+    values["exposure_time"] = command.exposure_time
     values |= {"frame_rate": None} if result.frame_rows is None else {"frame_rows": result.frame_rows}
-    values["scan_axis"] = given.scan_axis
-    values |= {"readout_direction": result.readout_direction} if given.by_motion else {}
+    values["scan_axis"] = command.scan_axis
+    values |= {"readout_direction": result.readout_direction} if command.by_motion else {}
     table = sensor_toml(values, ["Written by rsvib calibrate.", *result.notes])
     steps = ["enter the values that are left open"] * (" = \n" in table)
     if out is None:
@@ -275,23 +275,23 @@ def calibrate(given: CalibrateOptions) -> Answer:
     )
 
 
-def _known_of(given: CalibrateOptions, path: Path) -> Table:
+def _known_of(command: CalibrateOptions, path: Path) -> Table:
     """Arguments of the function that measures the row time."""
-    known: Table = {"frame_rate": given.frame_rate, "scan_axis": -1 if given.scan_axis == "x" else -2}
-    if not given.by_motion:
-        if given.row_time is not None or given.readout_direction is not None:
+    known: Table = {"frame_rate": command.frame_rate, "scan_axis": -1 if command.scan_axis == "x" else -2}
+    if not command.by_motion:
+        if command.row_time is not None or command.readout_direction is not None:
             raise ValueError("--row-time and --readout-direction are for --by-motion; leave them out")
-        if given.flicker_frequency is None:
+        if command.flicker_frequency is None:
             raise ValueError("give --frequency of the flicker, or --by-motion for frames of a vibrating camera")
-        return known | {"flicker_frequency": given.flicker_frequency}
-    if given.flicker_frequency is not None:
+        return known | {"flicker_frequency": command.flicker_frequency}
+    if command.flicker_frequency is not None:
         raise ValueError("--frequency is for a flickering light, not for --by-motion; leave it out")
-    if given.row_time is not None and len(given.row_time) != 2:
+    if command.row_time is not None and len(command.row_time) != 2:
         raise ValueError("give --row-time twice: the shortest and the longest possible row time")
-    if given.frame_rate is None:
+    if command.frame_rate is None:
         known["frame_rate"] = shared.rate_of_file(path)
     if known["frame_rate"] is None:
         raise ValueError("--by-motion needs --frame-rate of the sensor: the row time is found relative to it")
-    limits = None if given.row_time is None else tuple(given.row_time)
+    limits = None if command.row_time is None else tuple(command.row_time)
     known |= {} if limits is None else {"row_time": limits}
-    return known | {"readout_direction": given.readout_direction, "exposure_time": given.exposure_time}
+    return known | {"readout_direction": command.readout_direction, "exposure_time": command.exposure_time}

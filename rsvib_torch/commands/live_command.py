@@ -41,50 +41,50 @@ class LiveOptions(CameraOptions):
     """Stabilise the image to a straight line through the last part of its path."""
 
 
-def live_session(given: LiveOptions) -> Answer:
+def live_session(command: LiveOptions) -> Answer:
     """Follow the vibration of a running camera, and restore its frames.
 
     The source is never blocked: if frames come faster than they are processed, the oldest waiting ones are dropped and
     counted. Ctrl-C ends the session. The video can be played at any moment, also after a crash or on a full disk.
     """
-    camera = given.source == "-" or given.source.isdecimal() or "://" in given.source
-    inputs = [] if camera else io.stack_files(given.source)
+    camera = command.source == "-" or command.source.isdecimal() or "://" in command.source
+    inputs = [] if camera else io.stack_files(command.source)
     if inputs and not inputs[0].exists():
-        raise FileNotFoundError(f"{given.source}: no such file; a camera is a number or a URL")
-    settings = given.settings_for(None if camera else Path(given.source))
-    written = [] if given.out is None or str(given.out) == "-" else [given.out]
+        raise FileNotFoundError(f"{command.source}: no such file; a camera is a number or a URL")
+    settings = command.settings_for(None if camera else Path(command.source))
+    written = [] if command.out is None or str(command.out) == "-" else [command.out]
     for path in written:
-        check_file(path, given.overwrite, [*inputs, settings.path])
-    method: str = (settings.restoration | given.tracker).get("method", "dewarp")
+        check_file(path, command.overwrite, [*inputs, settings.path])
+    method: str = (settings.restoration | command.tracker).get("method", "dewarp")
     available = set(method_options(method)) - {"joint"}
     restoration = {name: value for name, value in settings.restoration.items() if name in available}
     source: video.CameraSource | video.FileSource
     if camera:
-        number = int(given.source) if given.source.isdecimal() else given.source
-        source = video.CameraSource(number, settings.timing, given.full_scale)
+        number = int(command.source) if command.source.isdecimal() else command.source
+        source = video.CameraSource(number, settings.timing, command.full_scale)
     else:
-        source = video.FileSource(Path(given.source), settings.timing, given.full_scale or settings.full_scale)
-    with _frames_on_standard_output(enabled=str(given.out) == "-") as stream:
+        source = video.FileSource(Path(command.source), settings.timing, command.full_scale or settings.full_scale)
+    with _frames_on_standard_output(enabled=str(command.out) == "-") as stream:
         outputs: list[video.FrameOutput] = [
-            video.VideoOutput(path, settings.timing.frame_rate, overwrite=given.overwrite) for path in written
+            video.VideoOutput(path, settings.timing.frame_rate, overwrite=command.overwrite) for path in written
         ]
         outputs += [] if stream is None else [video.PipeOutput(stream)]
         tracker = tracking.VibrationTracker(
             settings.timing,
-            **restoration | given.tracker | {"method": method},
-            steady=given.steady,
+            **restoration | command.tracker | {"method": method},
+            steady=command.steady,
             full_scale=source.full_scale,
             channels="first",
         )
         report = video.run_live(source, tracker, outputs)
     if report.frames == 0:
-        raise ValueError(f"{given.source}: no frame was read")
+        raise ValueError(f"{command.source}: no frame was read")
     slow = "dropped, because processing was too slow (fewer --columns)"
     missing = {slow: report.dropped, "not delivered by the source": report.lost}
     parts = [f"{number_of(count, 'frame')} {why}" for why, count in missing.items() if count]
     if parts:
         warn("; ".join(parts))
-    return _answer(given.source, report, written, waits=source.waits)
+    return _answer(command.source, report, written, waits=source.waits)
 
 
 @contextmanager

@@ -24,17 +24,17 @@ if TYPE_CHECKING:
     from rsvib_torch.io.stack_info import StackInfo
 
 
-def load(given: shared.StackCommand) -> tuple[Tensor, rsvib_torch.SensorTiming]:
+def load(command: shared.StackCommand) -> tuple[Tensor, rsvib_torch.SensorTiming]:
     """Read a stack that is processed as a whole, if the memory suffices for it.
 
     The frames are (T, H, W) or (T, C, H, W), full scale 1; the timing has the frame times of the file.
     """
-    device = stacks.chosen_device(given.device)
-    stacks.check_stack_fits(given.info, on_gpu=device.type != "cpu")
-    with working(f"reading {given.frames}"):
-        frames = io.read_stack(given.frames, full_scale=given.scale)
-    given.print_notes()
-    return frames.to(device), io.timing_from_first_frame(given.settings.timing, given.info)
+    device = stacks.chosen_device(command.device)
+    stacks.check_stack_fits(command.info, on_gpu=device.type != "cpu")
+    with working(f"reading {command.frames}"):
+        frames = io.read_stack(command.frames, full_scale=command.scale)
+    command.print_notes()
+    return frames.to(device), io.timing_from_first_frame(command.settings.timing, command.info)
 
 
 @options
@@ -45,20 +45,20 @@ class DetectCommand(shared.StackCommand, shared.PixelSizeOptions, shared.Verdict
     """Folder for vibration.json, tables (tones, offsets, spectrum) and figures."""
 
 
-def detect(given: DetectCommand) -> Answer:
+def detect(command: DetectCommand) -> Answer:
     """Detect the vibration in a stack of frames.
 
     The vibration is modelled as sinusoids of constant amplitude and frequency in all frames. For those that change, and
     for long stacks, see rsvib run, which detects in windows; for other motion see rsvib motion.
     """
-    settings, frames, out = given.settings, given.frames, given.out
-    answers.check_folder(out, answers.OF_DETECTION, given.overwrite, given.inputs)
-    pixels, timing = load(given)
+    settings, frames, out = command.settings, command.frames, command.out
+    answers.check_folder(out, answers.OF_DETECTION, command.overwrite, command.inputs)
+    pixels, timing = load(command)
     with working("detecting the vibration"):
         result = detection.detect_vibration(pixels, timing, channels=io.channels_of(pixels), **settings.detection)
     with whole(out, "folder") as folder:
-        names = answers.write_detection(folder, result, timing, given.pixel_size)
-    answer = answers.stack_answer(frames, result, given.pixel_size)
+        names = answers.write_detection(folder, result, timing, command.pixel_size)
+    answer = answers.stack_answer(frames, result, command.pixel_size)
     answer.next_steps += answers.steps_after_detection(result, frames, settings, out / "vibration.json")
     answers.remove_old(out, answers.OF_DETECTION, names)
     answer.files += [out / name for name in names]
@@ -74,22 +74,22 @@ class MotionCommand(shared.StackCommand, shared.VerdictOptions):
     detection: Annotated[Table, Given(FreeMotionOptions, ("knot_rows", "search"))]
 
 
-def motion(given: MotionCommand) -> Answer:
+def motion(command: MotionCommand) -> Answer:
     """Detect motion that is not a steady vibration.
 
     To restore frames with the CSV file: rsvib restore --motion FILE --unit px --offset 0.
     """
-    out, frames = given.out, given.frames
+    out, frames = command.out, command.frames
     if out.suffix.lower() != ".csv":
         raise ValueError(f"--out must be a .csv file, got {out}")
-    shared.check_file(out, given.overwrite, given.inputs)
-    pixels, timing = load(given)
+    shared.check_file(out, command.overwrite, command.inputs)
+    pixels, timing = load(command)
     with working("detecting the motion"):
-        result = detection.detect_motion(pixels, timing, channels=io.channels_of(pixels), **given.detection)
+        result = detection.detect_motion(pixels, timing, channels=io.channels_of(pixels), **command.detection)
     columns = reports.motion_columns(result, timing)
     reports.write_columns(out, columns)
     known_motion = ("--motion", out, "--unit", "px", "--offset", "0")
-    restore = ("restore", frames, frames.with_name("restored.tif"), *given.settings.arguments, *known_motion)
+    restore = ("restore", frames, frames.with_name("restored.tif"), *command.settings.arguments, *known_motion)
     return Answer(
         {f"Motion in {frames.name}": [result.summary()]},
         {"motion": answers.without_curves(result), "columns": list(columns)},
@@ -129,77 +129,79 @@ class RestoreCommand(shared.RestoringCommand):
         return self.restored.with_name(f"{self.restored.name}.manifest.json")
 
 
-def restore(given: RestoreCommand) -> Answer:
+def restore(command: RestoreCommand) -> Answer:
     """Restore a stack of frames with a detected vibration or a recorded motion.
 
     The offset of a recorded motion is stated (--offset); that of a gyroscope is found by the frames: rates that do not
     explain them are refused. If the restored frames are judged no better than the input, the input is written
     unchanged. --force restores in both cases.
     """
-    settings, vibration = given.settings, given.vibration
-    outputs = [*io.stack_files(given.restored), given.manifest]
-    shared.check_new(outputs, given.replaces, [*given.inputs, vibration, given.motion, given.lens_profile])
-    current_output().work = stacks.work_folder(given.restored)
-    check_writable(given.restored, "file" if given.restored.suffix else "folder")
+    settings, vibration = command.settings, command.vibration
+    outputs = [*io.stack_files(command.restored), command.manifest]
+    shared.check_new(outputs, command.replaces, [*command.inputs, vibration, command.motion, command.lens_profile])
+    current_output().work = stacks.work_folder(command.restored)
+    check_writable(command.restored, "file" if command.restored.suffix else "folder")
     # 1. The vibration of all frames, or the motion on the clock of the frames.
-    info, of_run = given.info, Table()
-    if vibration is not None and given.motion is None:
+    info, of_run = command.info, Table()
+    if vibration is not None and command.motion is None:
         of_recordings = ("offset", "unit", "ignore", "focal_length", "lens_profile")
-        if useless := [name for name in of_recordings if getattr(given, name) not in (None, ())]:
+        if useless := [name for name in of_recordings if getattr(command, name) not in (None, ())]:
             name = useless[0].replace("_", "-")
             raise ValueError(f"--{name} is for --motion, a recording; --vibration is that of the frames themselves")
         detected = reports.read_vibration(vibration, io.timing_from_first_frame(settings.timing, info))
-        given.print_notes()
+        command.print_notes()
         of_run |= {"given": [detected], "window": max(2, info.shape[0])}
         answer = Answer({"Vibration": [detected.summary()]}, {"detection": answers.without_curves(detected)})
-    elif given.motion is not None and vibration is None:
+    elif command.motion is not None and vibration is None:
         answer = Answer({}, {"alignment": None})
-        of_run["motion"] = _motion_of_frames(given, given.motion, replace(info, full_scale=given.scale), answer)
+        of_run["motion"] = _motion_of_frames(command, command.motion, replace(info, full_scale=command.scale), answer)
     else:
         raise ValueError("give --vibration FILE, or --motion FILE of a recording")
     # 2. Restoration in windows.
-    run = given.process(given.restored, of_run)
+    run = command.process(command.restored, of_run)
     stored = stacks.read_manifest(run.manifest)
     answer.results["Restoration"] = answers.restoration_lines(run, stored)
     answer.data["restoration"] = stored.totals()
-    answer.files += [given.restored, given.manifest]
+    answer.files += [command.restored, command.manifest]
     return answer
 
 
-def _motion_of_frames(given: RestoreCommand, path: Path, info: StackInfo, answer: Answer) -> rsvib_torch.FreeMotion:
+def _motion_of_frames(command: RestoreCommand, path: Path, info: StackInfo, answer: Answer) -> rsvib_torch.FreeMotion:
     """A recorded motion on the clock of the frames, which is stated or estimated."""
-    recorded, timing = _recorded(given, path), given.settings.timing
-    ignore = stacks.mask_of_regions(given.ignore or (), (info.shape[-2], info.shape[-1]))
-    given.print_notes()
+    recorded, timing = _recorded(command, path), command.settings.timing
+    ignore = stacks.mask_of_regions(command.ignore or (), (info.shape[-2], info.shape[-1]))
+    command.print_notes()
     if isinstance(recorded, rsvib_torch.FreeMotion):
-        if given.offset is None:
-            raise ValueError(f"--unit {given.unit} needs --offset: the time of the recording when frame 0 begins, in s")
-        return recorded.retimed(given.offset)
+        if command.offset is None:
+            raise ValueError(
+                f"--unit {command.unit} needs --offset: the time of the recording when frame 0 begins, in s"
+            )
+        return recorded.retimed(command.offset)
     camera = None
-    if given.lens_profile is not None:
-        camera = rsvib_torch.Camera.from_gyroflow(given.lens_profile, info.shape[-1], info.shape[-2])
-    elif given.focal_length is not None:
-        camera = rsvib_torch.Camera(given.focal_length)
+    if command.lens_profile is not None:
+        camera = rsvib_torch.Camera.from_gyroflow(command.lens_profile, info.shape[-1], info.shape[-2])
+    elif command.focal_length is not None:
+        camera = rsvib_torch.Camera(command.focal_length)
     with working("aligning the recording"):
-        alignment = stacks.align_stack(given.frames, info, timing, recorded, camera=camera, ignore=ignore)
+        alignment = stacks.align_stack(command.frames, info, timing, recorded, camera=camera, ignore=ignore)
     answer.results["Recording on the clock of the frames"] = [alignment.summary()]
     answer.data["alignment"] = answers.without_curves(alignment)
-    if alignment.reasons and not given.force:
+    if alignment.reasons and not command.force:
         raise ValueError(f"{path}: {'; '.join(alignment.reasons)}; --force restores with it nevertheless")
     for reason in alignment.reasons:
         warn(reason)
     return alignment.motion
 
 
-def _recorded(given: RestoreCommand, path: Path) -> rsvib_torch.FreeMotion | rsvib_torch.AngularRates:
+def _recorded(command: RestoreCommand, path: Path) -> rsvib_torch.FreeMotion | rsvib_torch.AngularRates:
     """The motion of a CSV file, or the rates of a gyroscope."""
-    if given.unit is not None:
-        if given.lens_profile is not None or given.ignore:
-            name = "--ignore" if given.lens_profile is None else "--lens-profile"
+    if command.unit is not None:
+        if command.lens_profile is not None or command.ignore:
+            name = "--ignore" if command.lens_profile is None else "--lens-profile"
             raise ValueError(f"{name} is for a gyroscope, without --unit")
-        return rsvib_torch.read_motion(path, unit=given.unit, focal_length=given.focal_length)
-    if given.offset is not None:
+        return rsvib_torch.read_motion(path, unit=command.unit, focal_length=command.focal_length)
+    if command.offset is not None:
         raise ValueError("--offset needs --unit; axes and clock of a gyroscope are estimated from the frames")
-    if given.lens_profile is not None and given.focal_length is not None:
+    if command.lens_profile is not None and command.focal_length is not None:
         raise ValueError("--lens-profile and --focal-length both state the focal length: give one of them")
     return rsvib_torch.read_gyroscope(path)

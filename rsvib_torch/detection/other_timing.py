@@ -209,8 +209,8 @@ def searched_period(measurements: Measurements, timing: RowTiming, starts: Array
     def fits(factors: Array, rows: int, frequencies: Array | None = None) -> tuple[Array, Array]:
         """Square of the residual of one tone along each axis and its frequency, for each factor."""
         thinned = measurements.of_rows(slice(None, None, max(1, measurements.exposure_starts.shape[1] // rows)))
-        others = starts[0] + factors[:, None] * (starts - starts[0])
-        trial, fit = _with_starts(thinned, timing, starts, others, frequencies)
+        other_starts = starts[0] + factors[:, None] * (starts - starts[0])
+        trial, fit = _with_starts(thinned, timing, starts, other_starts, frequencies)
         return typical_size(trial, fit), fit.frequencies
 
     # 1. The stated timing, reversed readout, and other frame periods on a coarse grid.
@@ -255,8 +255,8 @@ def first_after_gap(bands: Measurements, timing: RowTiming, starts: Array) -> in
     """
     pairs = len(starts) - 1
     frames = np.arange(pairs + 1)
-    others = starts + timing.frame_period * ((frames >= frames[:, None]) & (frames[:, None] > 0))
-    trial, fit = _with_starts(bands, timing, starts, others)
+    other_starts = starts + timing.frame_period * ((frames >= frames[:, None]) & (frames[:, None] > 0))
+    trial, fit = _with_starts(bands, timing, starts, other_starts)
     sizes = median(split_axis(trial.sizes(residual_of(trial, fit)), 1, pairs, -1), 2)  # (F, P, A)
     stated, *with_gaps = np.nanmean(np.square(sizes), (1, 2))
     best = int(np.argmin(with_gaps))

@@ -133,13 +133,13 @@ def _rounds(
     stacks: list[Array] = []
     while True:
         running.step()
-        done = running.ended | running.settled
-        if done.any():
-            part = running.only(done)
+        finished = running.ended | running.settled
+        if finished.any():
+            part = running.only(finished)
             results, stacks = [*results, part.result()], [*stacks, part.stacks]
-        if done.all():
+        if finished.all():
             break
-        running = running.only(~done)
+        running = running.only(~finished)
         running.accelerate()
     return replace(_taken(results, np.concatenate(stacks).argsort()), frames=frames)
 

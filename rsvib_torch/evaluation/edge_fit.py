@@ -190,10 +190,10 @@ def check_edge(edge: Edge, limits: tuple[float, float]) -> float:
             "use a longer roi or a larger angle"
         )
     room = float(min(-distance[:, 0].max(), distance[:, -1].min()))
-    wanted = max(4.0, 3.0 * edge.width)
-    if room < wanted:
+    needed = max(4.0, 3.0 * edge.width)
+    if room < needed:
         raise ValueError(
-            f"the edge comes within {max(room, 0.0):.1f} px of the border of the roi, expected at least {wanted:.1f} px"
+            f"the edge comes within {max(room, 0.0):.1f} px of the border of the roi, expected at least {needed:.1f} px"
         )
     far = np.abs(distance) > 4 * edge.width
     _check_clipping(edge.roi[(distance < 0) & far], edge.roi[(distance > 0) & far], contrast, limits)

@@ -117,11 +117,11 @@ class MtfCurve(
         """MTF at frequencies of any shape, cycles/px, computed from the line spread function."""
         if not isinstance(frequency, Tensor):
             check_number("frequency", frequency, at_least=0.0, at_most=1.0)
-        wanted = torch.as_tensor(frequency, dtype=torch.float64, device=self.lsf.device)
-        if not bool(((wanted >= 0) & (wanted <= 1)).all()):
-            raise ValueError(f"frequency must lie within 0 ... 1 cycles/px, got {wanted.min():g} ... {wanted.max():g}")
-        spread = (value.cpu().numpy() for value in (wanted.flatten(), self.position, self.lsf))
-        return torch.from_numpy(np.abs(_transfer(*spread))).to(wanted).view(wanted.shape)
+        points = torch.as_tensor(frequency, dtype=torch.float64, device=self.lsf.device)
+        if not bool(((points >= 0) & (points <= 1)).all()):
+            raise ValueError(f"frequency must lie within 0 ... 1 cycles/px, got {points.min():g} ... {points.max():g}")
+        spread = (value.cpu().numpy() for value in (points.flatten(), self.position, self.lsf))
+        return torch.from_numpy(np.abs(_transfer(*spread))).to(points).view(points.shape)
 
 
 @checks_arguments

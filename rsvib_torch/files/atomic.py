@@ -85,8 +85,8 @@ def full_disk_named(path: Path, more: Callable[[], str] = str) -> Iterator[None]
     try:
         yield
     except (OSError, RuntimeError) as error:
-        stated = re.search(r"errno = (\d+)", str(error))  # in a text of HDF5
-        number = int(stated[1]) if stated else getattr(error, "errno", None)
+        match = re.search(r"errno = (\d+)", str(error))  # in a text of HDF5
+        number = int(match[1]) if match else getattr(error, "errno", None)
         if "requested and" in str(error):  # NumPy does not state why an array is cut off
             number = errno.ENOSPC
         if number not in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT):

@@ -190,9 +190,9 @@ def _sample_times(packets: list[_Packet], counts: Array) -> Array:
     """
     # Number of each sample: those that are missing have numbers, if the totals (TSMP) are stated.
     ends = np.cumsum(counts)
-    stated = np.array([packet.gyroscope.get(b"TSMP", np.full((1, 1), np.nan))[0, 0] for packet in packets])
-    if (np.diff(stated) >= counts[1:]).all():
-        ends = (stated - stated[0]).astype(np.int64) + counts[0]
+    totals = np.array([packet.gyroscope.get(b"TSMP", np.full((1, 1), np.nan))[0, 0] for packet in packets])
+    if (np.diff(totals) >= counts[1:]).all():
+        ends = (totals - totals[0]).astype(np.int64) + counts[0]
     number = np.concatenate([end - count + np.arange(count) for end, count in zip(ends, counts, strict=True)])
     # Time of each number, of a few packets by their duration.
     starts = np.array([packet.start for packet in packets])

@@ -274,8 +274,8 @@ def align_rates(
         near = start.cost < _MAX_COST * best.cost
         return near and fit.significance(start.orientation, parameters(start, row_time)) < _CERTAIN
 
-    others = [start for start in starts if start.orientation != fit.model.orientation][:_MOST_OTHERS]
-    axes = [start.orientation for start in others if explains(start)]
+    other_starts = [start for start in starts if start.orientation != fit.model.orientation][:_MOST_OTHERS]
+    axes = [start.orientation for start in other_starts if explains(start)]
     other = next((start.offset for start in other_offsets[:_MOST_OTHERS] if explains(start)), None)
     ambiguous: list[Reason] = []
     if mirrored is not None:

@@ -80,8 +80,8 @@ def _write_png(path: Path, frame: Array, info: StackInfo) -> None:
     """Write one frame (H, W) or (C, H, W), with full scale and orientation in chunks of their own."""
     if frame.ndim == 3:
         frame = np.moveaxis(frame, 0, -1)[..., (2, 1, 0, 3)[: frame.shape[0]] if frame.shape[0] > 1 else (0,)]
-    done, encoded = cv2.imencode(".png", np.ascontiguousarray(frame))
-    if not done:
+    is_encoded, encoded = cv2.imencode(".png", np.ascontiguousarray(frame))
+    if not is_encoded:
         raise ValueError(f"{path}: frames of shape {frame.shape} {frame.dtype} cannot be written as PNG")
     data = encoded.tobytes()
     with path.open("wb") as file:

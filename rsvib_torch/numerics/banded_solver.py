@@ -31,15 +31,14 @@ def _eliminated(skewed: Tensor, steps: int) -> tuple[Tensor, Tensor]:
     width, (line, entry, _) = skewed.shape[1] // 2, skewed.stride()
     first = skewed.storage_offset() + line
     pivots, upper = skewed[:steps, width], skewed[: len(skewed) - width, width + 1 :]
-    inverse = torch.empty_like(pivots)
     # A[i, j] of step j, and A[i, k]: strided views, because row j + 1 begins one column further right
     strides = (line, line - entry, entry, 1)
     below = skewed.as_strided((steps, width, 1, skewed.shape[2]), strides, first + (width - 1) * entry)
     trailing = skewed.as_strided((steps, width, width, skewed.shape[2]), strides, first + width * entry)
-    views = (pivots, inverse, upper[:steps], below, trailing)
-    for pivot, over, row, column, rest in zip(*(values.unbind() for values in views), strict=True):
-        torch.reciprocal(pivot, out=over)
-        rest.addcmul_(column, row.mul_(over), value=-1)
+    views = (pivots, upper[:steps], below, trailing)
+    for pivot, row, column, remaining in zip(*(values.unbind() for values in views), strict=True):
+        remaining.addcmul_(column, row.div_(pivot), value=-1)
+    inverse = pivots.reciprocal()
     return upper, inverse.real if inverse.is_complex() else inverse
 
 
@@ -219,12 +218,12 @@ class InterpolatedFactors:
 
     def at(self, part: slice) -> BandedFactor:
         """Factors of n S matrices at S consecutive frequencies."""
-        chosen = torch.arange(part.start, part.stop, dtype=torch.float64, device=self.nodes.device)
-        ends = torch.searchsorted(self.nodes, chosen[[0, -1]].long(), right=True)
+        frequencies = torch.arange(part.start, part.stop, dtype=torch.float64, device=self.nodes.device)
+        ends = torch.searchsorted(self.nodes, frequencies[[0, -1]].long(), right=True)
         first, last = ends.clamp(max=len(self.nodes) - 1).tolist()
         near = slice(first - 1, last + 1)
         places = self.nodes[near].to(torch.float64)
-        rising = (chosen - places[:-1, None]) / places.diff()[:, None]
+        rising = (frequencies - places[:-1, None]) / places.diff()[:, None]
         one = torch.ones_like(rising[:1])
         hat = torch.minimum(torch.cat([one, rising]), torch.cat([1 - rising, one])).clamp(min=0)  # (nodes, S)
         return BandedFactor(*((values[..., near] @ hat.to(values)).flatten(-2) for values in self.tensors))

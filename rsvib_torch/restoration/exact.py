@@ -151,16 +151,16 @@ class FrameModel(MovingFrames):
         if not isinstance(self.prior, RowPrior):
             return np.ones(len(scenes.stack))  # the strength of other priors is not selected
         _, first, of_scenes = np.unique(scenes.stack[:, 0] // self.strips, return_index=True, return_inverse=True)
-        chosen = take_stacks([scenes], first)
-        chosen = replace(chosen, contributes=chosen.contributes & (chosen.moved == 0).all(-1))
-        stack_of, member_of = self._indices(chosen)
+        first_scenes = take_stacks([scenes], first)
+        first_scenes = replace(first_scenes, contributes=first_scenes.contributes & (first_scenes.moved == 0).all(-1))
+        stack_of, member_of = self._indices(first_scenes)
         rows = sampled_rows(self.images.shape[-2])
         strengths = prior_strengths(
             self.images[..., rows, :][stack_of, member_of],
-            self._row_kernels(chosen).rows(rows),
+            self._row_kernels(first_scenes).rows(rows),
             self.prior.of(stack_of[:, 0], member_of),
             self.level[stack_of].square(),
-            torch.as_tensor(chosen.blur_reach[:, None], device=self.images.device),
+            torch.as_tensor(first_scenes.blur_reach[:, None], device=self.images.device),
         )
         return strengths[of_scenes]
 
@@ -215,9 +215,9 @@ class FrameModel(MovingFrames):
         return with_missing_values(problem, problem.solver(keep=True), measured, floor)
 
 
-def model_frames(given: MovingFrames, *, noise: float | Literal["auto"] = "auto", scale: int = 1) -> FrameModel:
+def model_frames(moving: MovingFrames, *, noise: float | Literal["auto"] = "auto", scale: int = 1) -> FrameModel:
     """Noise levels, period and prior of frames; ``noise`` and ``scale`` are those of ``restore``."""
-    frames, motion, strips, ignore, clipped = given.images, given.motion, given.strips, given.ignore, given.clipped
+    frames, motion, strips, ignore, clipped = moving.images, moving.motion, moving.strips, moving.ignore, moving.clipped
     B, T, _, _, W = frames.shape
     unknown = ignore if clipped is None else clipped if ignore is None else ignore | clipped
 
@@ -225,10 +225,10 @@ def model_frames(given: MovingFrames, *, noise: float | Literal["auto"] = "auto"
     # noise as well as all of them, in a fraction of the time. Saturated pixels have no noise: with a quarter of a frame
     # saturated, the level was 0, and the PSNR 4 dB lower.
     if noise == "auto":
-        chosen = sorted({strips // 4, strips - 1 - strips // 4})
-        parts = [first + strip for first in range(0, B, strips) for strip in chosen]
+        strips_for_noise = sorted({strips // 4, strips - 1 - strips // 4})
+        parts = [first + strip for first in range(0, B, strips) for strip in strips_for_noise]
         estimated = noise_levels(frames[parts], motion.of(parts), None if unknown is None else unknown[parts])
-        powers = estimated.square().unflatten(0, (-1, len(chosen))).mean(1).repeat_interleave(strips, 0)
+        powers = estimated.square().unflatten(0, (-1, len(strips_for_noise))).mean(1).repeat_interleave(strips, 0)
     else:
         powers = frames.new_full((B, T), noise**2)
     powers = powers.clamp(min=MIN_LEVEL**2)
@@ -246,7 +246,7 @@ def model_frames(given: MovingFrames, *, noise: float | Literal["auto"] = "auto"
         of_stacks = ([stack] for stack in range(B))
         prior = [fit_polynomial_prior(frames[one], motion.of(one), levels[one], period) for one in of_stacks]
     return FrameModel(
-        **vars(given),
+        **vars(moving),
         weights=frame_weights * unit_variance[:, None],
         level=unit_variance.sqrt(),
         mean=brightness(frames).mean(1)[..., None, None],

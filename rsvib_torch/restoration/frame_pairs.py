@@ -24,31 +24,31 @@ _RIM = math.ceil(3 * _SMOOTHING) + 1  # px; half width of the kernels of ``misfi
 _MARGIN = 4  # px between the compared pixels and those outside the frame
 
 
-def judged_columns(given: MovingFrames, restored: Tensor, count: int | None) -> tuple[MovingFrames, Tensor]:
+def judged_columns(moving: MovingFrames, restored: Tensor, count: int | None) -> tuple[MovingFrames, Tensor]:
     """Frames and restored frames in the columns by which the restoration is judged: ``count`` or more, None for all.
 
     These are the columns with the most detail, and as many beside them as move into them. With roll or zoom, they are a
     strip in the middle of one half of the frames.
     """
-    motion, (height, width) = given.motion, given.images.shape[-2:]
+    motion, (height, width) = moving.motion, moving.images.shape[-2:]
     if motion.vibration.same_for_all_columns:
         motion.check_fits(width)
         widest = int(np.ptp(table(motion.shift)[..., 0], axis=1).max())
         beside = 2 * (motion.displacement_bound() + 4 * _MARGIN) + widest
         if count is None or count + beside >= width:
-            return given, restored
-        chosen = detailed_parts(given.images, count + beside)
+            return moving, restored
+        chosen = detailed_parts(moving.images, count + beside)
     else:
         strip = min(_STRIP, width // 2)
         halves = [slice(place - strip // 2, place - strip // 2 + strip) for place in (width // 4, width - width // 4)]
-        both = torch.cat([given.images[:, :1, ..., half] for half in halves], -1)
+        both = torch.cat([moving.images[:, :1, ..., half] for half in halves], -1)
         chosen = [halves[0 if detailed.start < strip // 2 else 1] for detailed in detailed_parts(both, strip)]
         middles = [half.start + 0.5 * (strip - width) for half in chosen]
         columns = torch.tensor(middles, dtype=torch.float64, device=both.device)
         starts = tuple(motion.frame_starts.tolist())
         of_strips = ColumnMotion(motion.vibration, columns, starts, motion.timing.row_time, height)
         motion = frame_motion(of_strips, motion.timing, motion.frame_starts, height)
-    cut = replace(given.mapped(lambda values: cut_columns(values, chosen)), motion=motion)
+    cut = replace(moving.mapped(lambda values: cut_columns(values, chosen)), motion=motion)
     return cut, cut_columns(restored, chosen)
 
 

@@ -183,9 +183,9 @@ def judge_stacks(
     pairs = pairs_to_judge(motion.shift.shape[1], joint, most)
     dtype = torch.promote_types(frames.images.dtype, restored.dtype)
     raw, still = (images.to(dtype) for images in frames.compared(restored))
-    given, still = judged_columns(MovingFrames(raw, motion, frames.missing), still, columns)
+    moving, still = judged_columns(MovingFrames(raw, motion, frames.missing), still, columns)
     numbers = np.array([(stack, *pair) for stack in stacks for pair in pairs], np.int64).reshape(-1, 3)
-    common = common_parts(given.motion, numbers, given.images.shape[-2:])
+    common = common_parts(moving.motion, numbers, moving.images.shape[-2:])
 
     # 2. Pairs whose common parts have the same size are judged together, as many as the memory allows.
     shared = len(joint_groups(raw.shape[1], joint)[0][0])  # frames from which one image is restored
@@ -197,7 +197,7 @@ def judge_stacks(
         pair_bytes = 64 * raw.shape[2] * int(size[:2].prod())
         for part in runs(len(members), at_once(pair_bytes, raw.device, cpu_bytes=2**26)):
             some = members[part]
-            verdicts_of_pairs = _judge_pairs(given, still, take_stacks([common], some), shared)
+            verdicts_of_pairs = _judge_pairs(moving, still, take_stacks([common], some), shared)
             judged |= zip(some.tolist(), verdicts_of_pairs, strict=True)
             advance(len(some))
 
@@ -207,7 +207,7 @@ def judge_stacks(
         unjudged = [number for number in of_stack if number not in judged]
         if unjudged:
             (earlier, later), (down, right) = common.frames[unjudged[0]], common.step[unjudged[0]]
-            height, width = given.images.shape[-2:]
+            height, width = moving.images.shape[-2:]
             verdicts.append(
                 TooLittleInCommonError(
                     f"frames {earlier} and {later} have nothing in common, or too little: they lie ({right}, {down}) "
@@ -260,7 +260,7 @@ class FramePairs:
     noise: Array  # (N,) power of the noise of the raw frames
 
 
-def cut_pairs(given: MovingFrames, restored: Tensor, common: CommonParts) -> FramePairs:
+def cut_pairs(moving: MovingFrames, restored: Tensor, common: CommonParts) -> FramePairs:
     """Cut pairs of frames, and those restored from them, to their common parts, which have one size.
 
     Restored frames are as the images of the given ones, or (B, 1, C, H, W) in the coordinates of the earlier frame of
@@ -275,18 +275,18 @@ def cut_pairs(given: MovingFrames, restored: Tensor, common: CommonParts) -> Fra
         return cut_parts(images, (common.stack, frame), place[:, 0], place[:, 1], (height, width))
 
     # 1. Both restored frames with the motion of the later frame.
-    raw, raw_later = cut(given.images, earlier, first), cut(given.images, later, second)
+    raw, raw_later = cut(moving.images, earlier, first), cut(moving.images, later, second)
     still = cut(restored, np.zeros_like(earlier) if single else earlier, first)
     still_later = still if single else cut(restored, later, second)
     both = torch.stack([still, still_later], 1)
-    predicted, formed_later = reblur(both, given.motion, common.stack, later, second[:, 0]).unbind(1)
+    predicted, formed_later = reblur(both, moving.motion, common.stack, later, second[:, 0]).unbind(1)
     changed = formed_later - still_later
     # 2. Predicted values at missing pixels, and the part that is compared.
     inner = (..., slice(rim_y, height - rim_y), slice(rim_x, width - rim_x))
     missing, share = None, np.zeros(len(raw))
-    if given.ignore is not None:
-        missing = torch.stack([cut(given.ignore, earlier, first), cut(given.ignore, later, second)], 1)
-        of_earlier = reblur(still[:, None], given.motion, common.stack, earlier, first[:, 0])[:, 0]
+    if moving.ignore is not None:
+        missing = torch.stack([cut(moving.ignore, earlier, first), cut(moving.ignore, later, second)], 1)
+        of_earlier = reblur(still[:, None], moving.motion, common.stack, earlier, first[:, 0])[:, 0]
         raw = torch.where(missing[:, 0], of_earlier, raw)
         # what was restored near missing pixels of the earlier frame is a guess, which the later frame does not confirm
         near = functional.max_pool2d(missing[:, 0].to(raw.dtype), 2 * _NEAR + 1, 1, _NEAR) > 0
@@ -317,12 +317,12 @@ def cut_pairs(given: MovingFrames, restored: Tensor, common: CommonParts) -> Fra
     return FramePairs(raw, raw_later, still, still_later, predicted, changed, share, noise)
 
 
-def _judge_pairs(given: MovingFrames, restored: Tensor, common: CommonParts, shared: int) -> list[PairVerdict]:
+def _judge_pairs(moving: MovingFrames, restored: Tensor, common: CommonParts, shared: int) -> list[PairVerdict]:
     """Verdicts on pairs of frames in row order, whose common parts have one size.
 
     ``shared`` are the frames from which one image is restored.
     """
-    pairs = cut_pairs(given, restored, common)
+    pairs = cut_pairs(moving, restored, common)
     single, noise = pairs.restored_later is None, pairs.noise
 
     # 1. Displacement between the raw frames, and between the later one and its prediction. An image restored from both
@@ -340,7 +340,7 @@ def _judge_pairs(given: MovingFrames, restored: Tensor, common: CommonParts, sha
         (pairs.later - pairs.predicted).square(),
         (pairs.predicted - pairs.restored) * pairs.changed_later,
     ]
-    displacement = given.motion.mean_displacement[common.stack[:, None], common.frames].diff(dim=1)[:, 0]  # (N, R, 2)
+    displacement = moving.motion.mean_displacement[common.stack[:, None], common.frames].diff(dim=1)[:, 0]  # (N, R, 2)
     means = [values.mean((1, 2, 3), dtype=torch.float64) for values in squares]
     after, unexplained, change, *offset = table(torch.stack([*means, *displacement.square().mean(1).sqrt().unbind(-1)]))
 

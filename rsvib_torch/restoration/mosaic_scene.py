@@ -34,7 +34,7 @@ _COMPONENTS = ((3**-0.5,) * 3, (2**-0.5, 0.0, -(2**-0.5)), (6**-0.5, -2 * 6**-0.
 _ACCURACY = 0.02
 
 
-def restore_mosaic(given: MovingFrames, colours: Tensor, options: ExactOptions) -> Tensor:
+def restore_mosaic(moving: MovingFrames, colours: Tensor, options: ExactOptions) -> Tensor:
     """Colour images (B, groups, 3, scale H, scale W) from mosaics: all frames of a group and all colours together.
 
     The scene is unknown on a grid of half pixels, and each pixel measures one of its colours. Luminance and two colour
@@ -46,7 +46,7 @@ def restore_mosaic(given: MovingFrames, colours: Tensor, options: ExactOptions) 
     of one frame is too low rather than too high.
     """
     # 1. Check the options, and list the frames of each result.
-    frames, motion = given.images, given.motion
+    frames, motion = moving.images, moving.motion
     height, width = frames.shape[-2:]
     check_prior(options.prior, scale=options.scale, mosaic=True)
     groups = joint_groups(frames.shape[1], options.joint)
@@ -60,11 +60,11 @@ def restore_mosaic(given: MovingFrames, colours: Tensor, options: ExactOptions) 
         measured = measures(colours[stack])
         linear = interpolated_colours(mosaic, colours[stack])
         floor = None
-        if given.clipped is not None:
-            floor = torch.where(measured & given.clipped[stack], mosaic, -torch.inf)
-            measured = measured & ~given.clipped[stack]
-        if given.ignore is not None:
-            measured = measured & ~given.ignore[stack]
+        if moving.clipped is not None:
+            floor = torch.where(measured & moving.clipped[stack], mosaic, -torch.inf)
+            measured = measured & ~moving.clipped[stack]
+        if moving.ignore is not None:
+            measured = measured & ~moving.ignore[stack]
         if options.noise == "auto":  # of colours whose noise was halved by interpolation
             level = 2 * noise_levels(linear.detach()[None], motion.of([stack])).square().mean().sqrt()
         else:

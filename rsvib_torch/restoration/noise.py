@@ -174,11 +174,11 @@ def _residual_power(images: Tensor, displacement: Tensor, node_weights: Tensor) 
     paths = displacement.flatten(0, 1)
     kernels = RowKernels.of_rows(paths, node_weights, paths.new_ones(len(paths)), num_rows, margin=4 * _MIN_SIDE)
     count = min(24, width // 4)
-    chosen = np.linspace(width // 4, width // 2, count, dtype=np.float32).astype(np.int64)
+    cycles = np.linspace(width // 4, width // 2, count, dtype=np.float32).astype(np.int64)
     # correlation 0.9 of neighbouring rows of the scene, of weight 1e-4 beside the data
     products = torch.tensor([[1.0, 0.9**2], [-0.9, 0.0]], dtype=torch.float64, device=images.device)
     precision = 1e-4 * products[:, :, None, None].expand(-1, -1, len(images), count)
-    power, freedom = unexplained(images, kernels, chosen, precision)
+    power, freedom = unexplained(images, kernels, cycles, precision)
     return torch.as_tensor(power[0].sum(-1) / freedom[0].sum(-1), dtype=images.dtype, device=images.device)
 
 

@@ -39,16 +39,16 @@ _DEWARP_DEGREE = 5  # of the B-spline across rows
 _CHUNK_ROWS = 512  # interpolated at a time; 128 take 1.2 times as long for 256 rows
 
 
-def restore_dewarp(given: MovingFrames, options: DewarpOptions = DewarpOptions()) -> Tensor:  # noqa: B008
+def restore_dewarp(moving: MovingFrames, options: DewarpOptions = DewarpOptions()) -> Tensor:  # noqa: B008
     """Undo the displacement of every row of frames, not its blur: sufficient for short exposures.
 
     Scene row s is interpolated at frame row r(s) by a quintic B-spline across rows and moved back along the row by the
     mean displacement (Eq. 2) of that row with a phase ramp. Noise is not amplified.
     """
-    (B, T, _, H, W), dtype = given.images.shape, given.images.dtype
-    length = extended_length(W, given.motion.displacement_bound())
-    taps, weights, displacement = _shown_rows(given.motion, dtype)
-    spectra = torch.view_as_real(spline_spectra(given.images, _DEWARP_DEGREE, length)).movedim(2, 3)
+    (B, T, _, H, W), dtype = moving.images.shape, moving.images.dtype
+    length = extended_length(W, moving.motion.displacement_bound())
+    taps, weights, displacement = _shown_rows(moving.motion, dtype)
+    spectra = torch.view_as_real(spline_spectra(moving.images, _DEWARP_DEGREE, length)).movedim(2, 3)
 
     def restored(part: slice) -> Tensor:
         """Some rows (B T, R, C, W) of all images."""
@@ -208,7 +208,7 @@ def _noise_to_signal(frames: Tensor, value: float | Literal["auto"]) -> Tensor:
     return (variance / gradients.clamp(min=tiny)).clamp(lowest, highest)
 
 
-def restore_banded(given: MovingFrames, options: BandedOptions) -> Tensor:
+def restore_banded(moving: MovingFrames, options: BandedOptions) -> Tensor:
     """Restore frames slab by slab (Sec. 3.2 of Liu et al. 2023).
 
     Scene row k appears at frame row r(k). The slab of rows r(k) - l ... r(k) + l, l = ``half_rows``, is assumed to have
@@ -217,7 +217,7 @@ def restore_banded(given: MovingFrames, options: BandedOptions) -> Tensor:
     Whole pixels of the displacement shift the slab. Rows are extended smoothly at their ends and mirrored above and
     below. All pixels count, those without data with their local means.
     """
-    frames, motion = given.images, given.motion
+    frames, motion = moving.images, moving.motion
     B, T, C, H, W = frames.shape
     half_rows = check_whole_number("half_rows", options.half_rows, at_least=1, at_most=max(16, H))
     weights = _noise_to_signal(frames, options.noise_to_signal)
@@ -267,7 +267,7 @@ def restore_banded(given: MovingFrames, options: BandedOptions) -> Tensor:
     return stacked.movedim(3, 2)
 
 
-def restore_richardson_lucy(given: MovingFrames, options: RichardsonLucyOptions) -> Tensor:
+def restore_richardson_lucy(moving: MovingFrames, options: RichardsonLucyOptions) -> Tensor:
     """Restore frames by Richardson-Lucy iterations on the row-varying blur; negative values count as 0.
 
     ``c <- c K^T(m g / K c) / K^T m`` increases the likelihood of the scene for Poisson counts g of the measured pixels
@@ -275,7 +275,7 @@ def restore_richardson_lucy(given: MovingFrames, options: RichardsonLucyOptions)
     B-splines are positive, hence the scene is non-negative, and they do not add the blur of linear interpolation. The
     initial scene is the result of ``restore_dewarp``; fewer iterations amplify less noise.
     """
-    frames, motion = given.images, given.motion
+    frames, motion = moving.images, moving.motion
     # 1. The operator: kernels of all channels of a frame, which act on the coefficients themselves (degree 1).
     psf = trajectory_psf(*motion.exposures, interpolation="cubic")
     first_tap = psf.first_tap - motion.shift.to(torch.int64)[:, :, None]
@@ -285,7 +285,7 @@ def restore_richardson_lucy(given: MovingFrames, options: RichardsonLucyOptions)
     # 2. Counts of the measured pixels, and the coefficients that affect them by more than a tenth of a pixel; others
     # keep their initial value.
     tiny = torch.finfo(frames.dtype).tiny
-    measured = torch.ones_like(frames) if given.ignore is None else (~given.ignore).to(frames.dtype)
+    measured = torch.ones_like(frames) if moving.ignore is None else (~moving.ignore).to(frames.dtype)
     counts = frames.clamp(min=0.0) * measured
     sensitivity = blur.A_adjoint(measured)
     visible = sensitivity > 0.1
@@ -293,7 +293,7 @@ def restore_richardson_lucy(given: MovingFrames, options: RichardsonLucyOptions)
     mean = (total / pixels.clamp(min=1.0)).clamp(min=tiny)
 
     # 3. The iterations; from a lower value than the least initial one, multiplicative updates need many of them.
-    scene = torch.maximum(restore_dewarp(given), 1e-4 * mean)
+    scene = torch.maximum(restore_dewarp(moving), 1e-4 * mean)
     advance = steps(options.iterations, "iterations")
     for _ in range(options.iterations):
         ratio = counts / blur(scene).clamp(min=tiny)

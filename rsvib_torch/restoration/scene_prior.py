@@ -218,9 +218,9 @@ def observed_spectrum(frames: Tensor, motion: FrameMotion, levels: Tensor, lengt
     piece_bytes = 8 * frames[..., 0, 0].numel() * len(lefts) * size[0] * size[1]
     step = at_once(piece_bytes, frames.device, cpu_bytes=2**24)
     powers = []
-    for chosen in runs(len(tops), step):
-        pieces = frames[..., rows[chosen, None, :, None], columns[:, None]]  # (N, T, C, n, m, rows, columns)
-        spectra = torch.fft.rfft(pieces.sub_(bright[..., None]).mul_(tapers[1])).mul_(back[:, :, None, chosen, None])
+    for part in runs(len(tops), step):
+        pieces = frames[..., rows[part, None, :, None], columns[:, None]]  # (N, T, C, n, m, rows, columns)
+        spectra = torch.fft.rfft(pieces.sub_(bright[..., None]).mul_(tapers[1])).mul_(back[:, :, None, part, None])
         powers.append(squared_modulus(torch.fft.fft(spectra, dim=-2)).mean((2, 4)).transpose(-2, -1))
     power = torch.cat(powers, dim=2).to(torch.float64)
     # Power of a few strips of whole rows with their boundary extension, pooled to the frequencies of the pieces. Rows
@@ -253,11 +253,11 @@ def fit_prior(frames: Tensor, motion: FrameMotion, levels: Tensor, length: int) 
 
 @torch.no_grad()
 def unexplained(
-    images: Tensor, kernels: RowKernels, chosen: NDArray[np.int64], precisions: Tensor
+    images: Tensor, kernels: RowKernels, cycles: NDArray[np.int64], precisions: Tensor
 ) -> tuple[Array, Array]:
     """Residuals of fits to S scenes of images (S, M, C, R, W) with each of some priors, frequency by frequency.
 
-    ``kernels`` are those of the rows of S M images; the frequencies ``chosen`` (F,) are in cycles in W px. The priors P
+    ``kernels`` are those of the rows of S M images; the frequencies ``cycles`` (F,) are in cycles in W px. The priors P
     are products (p + 1, p + 1, P S, F) as from ``RowPrior.precision``, of all scenes one after the other. The results
     (P, S, F) are the squared residuals of all rows, mean over channels, in units of the noise of one pixel; and the
     number of rows of a weight above 0, less the degrees of freedom of the fit.
@@ -265,9 +265,9 @@ def unexplained(
     scenes, members, channels, height, width = images.shape
     # 1. Spectra of the tapered rows, minus the mean of the image, with the phase of each row's middle taken off.
     taper = np.hanning(width + 2)[1:-1]
-    u = torch.from_numpy(chosen / width)
+    u = torch.from_numpy(cycles / width)
     deviations = (images - images.mean((-2, -1), keepdim=True)) * torch.from_numpy(taper).to(images)
-    spectra = torch.fft.rfft(deviations)[..., torch.from_numpy(chosen).to(images.device)]
+    spectra = torch.fft.rfft(deviations)[..., torch.from_numpy(cycles).to(images.device)]
     phases = waves(-kernels.middle, u.to(images.device)).to(spectra.dtype)
     spectra = spectra * phases.unflatten(0, (scenes, members))[:, :, None]
     centred = replace(kernels, middle=torch.zeros_like(kernels.middle))
@@ -321,15 +321,15 @@ def prior_strengths(
     if min(height, width) < 64:  # too few values for a choice
         return np.ones(len(images))
     # 1. Fits with the prior at all strengths, at frequencies from 0.02 cycles per px, below which the taper mixes them.
-    chosen = np.linspace(0.02 * width, width // 2, min(_FREQUENCIES, width // 4), dtype=np.float32).astype(np.int64)
-    place = torch.from_numpy(np.rint(chosen / width * 2 * (prior.power.shape[-1] - 1)).astype(np.int64))
+    cycles = np.linspace(0.02 * width, width // 2, min(_FREQUENCIES, width // 4), dtype=np.float32).astype(np.int64)
+    place = torch.from_numpy(np.rint(cycles / width * 2 * (prior.power.shape[-1] - 1)).astype(np.int64))
     scenes, members, number = *prior.interpolation_power.shape[:2], len(_STRENGTHS)
     at = RowPrior(*(values[..., place.to(values.device)] for values in vars(prior).values()))
     stacks, frames = (torch.arange(count, device=images.device) for count in (scenes, members))
     of_all = at.of(stacks.repeat(number), frames)
     strength = torch.from_numpy(_STRENGTHS.repeat(scenes)[:, None]).to(noise_power)
     precisions = of_all.precision(noise_power.repeat(number, 1), strength, blur_reach.repeat(number, 1))
-    power, freedom = unexplained(images, kernels, chosen, precisions)
+    power, freedom = unexplained(images, kernels, cycles, precisions)
     # 2. ``n |r|^2 / (n - freedom)^2`` of Craven and Wahba (1979) estimates the squared error of predicting a pixel from
     # all others. The sum over the frequencies is dominated by those with the largest errors; the geometric mean gives
     # all the same weight. The weaker of the two selected priors is used: with the sum alone, five of 124 restorations

@@ -242,8 +242,8 @@ def candidates(tones: list[_Tones], clock: CameraClock) -> list[Candidate]:
     # 3. Different ones that are possible.
     possible: list[Candidate] = []
     for one in map(Candidate, row_times.tolist(), stds.tolist(), chi_square.tolist()):
-        known = any(abs(one.row_time - other.row_time) < 1e-3 * one.std + 1e-9 * clock.high for other in possible)
-        if clock.allows(one.row_time) and not known:
+        is_known = any(abs(one.row_time - other.row_time) < 1e-3 * one.std + 1e-9 * clock.high for other in possible)
+        if clock.allows(one.row_time) and not is_known:
             possible.append(one)
     return sorted(possible, key=lambda candidate: candidate.chi_square)
 

@@ -152,10 +152,10 @@ class StackJob:
         """The motion in the frames of a window, given or measured."""
         if self.given is None:
             return measured_motion(frames, timing, self.options.detection or {})
-        given = self.given[window.index]
-        if given is None:
+        motion = self.given[window.index]
+        if motion is None:
             raise ValueError("no detection was given for this window")
-        return WindowMotion(given, given if isinstance(given, DetectedVibration) else None, timing)
+        return WindowMotion(motion, motion if isinstance(motion, DetectedVibration) else None, timing)
 
     def _counts(self, frames: Tensor) -> Array:
         """Frames as the file has them."""

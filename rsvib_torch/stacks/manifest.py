@@ -36,9 +36,9 @@ from rsvib_torch.text import measured_text, number_of, text_table, wrapped
 
 def rms_shaking(parts: Iterable[dict[str, tuple[float, ...]] | None]) -> dict[str, tuple[float, ...]]:
     """Rms of ``WindowRecord.shaking`` over the parts of a video; empty if it was measured in none of them."""
-    known = [part for part in parts if part is not None]
-    names = known[0] if known else ()
-    return {name: tuple(np.sqrt(np.square([part[name] for part in known]).mean(0)).tolist()) for name in names}
+    measured = [part for part in parts if part is not None]
+    names = measured[0] if measured else ()
+    return {name: tuple(np.sqrt(np.square([part[name] for part in measured]).mean(0)).tolist()) for name in names}
 
 
 _UNITS = {
@@ -305,15 +305,15 @@ _SETTINGS = tuple(name for name in fields_of(StackOptions) if name not in ("memo
 
 def manifest_header(job: StackJob, output: str) -> Table:
     """Everything on which the result depends, for JSON: a run is resumed only if it is unchanged."""
-    given = None
+    digest = None
     if job.given is not None:
         plain = [DetectedVibration.of(one) if isinstance(one, DetectedVibration) else one for one in job.given]
-        given = hashlib.sha256(json.dumps(plain_values(plain)).encode()).hexdigest()
+        digest = hashlib.sha256(json.dumps(plain_values(plain)).encode()).hexdigest()
     options = {name: getattr(job.options, name) for name in _SETTINGS}
     options["device"] = job.options.device.partition(":")[0]
     return {
         "input": {**fingerprint(job.source), "shape": list(job.info.shape), "dtype": job.info.dtype},
-        "settings": {"sensor": job.timing.to_dict(), "given": given, **options},
+        "settings": {"sensor": job.timing.to_dict(), "given": digest, **options},
         "versions": {name: version(name) for name in ("rsvib_torch", "torch", "numpy")},
         "output": output,
     }

@@ -67,11 +67,11 @@ def _strongest_wave(fit: WindowFit, axis: int, readout: float) -> _Wave | None:
     without_tones, (grid, _, is_visible), rate = copy(fit), fit.searched(readout), 1.0 / fit.interval
     without_tones.tones = []
 
-    def best(searched: Array, wanted: NDArray[np.bool_], parts: Array) -> list[tuple[float, float, float, float]]:
+    def best(searched: Array, mask: NDArray[np.bool_], parts: Array) -> list[tuple[float, float, float, float]]:
         """Sum of squares that a wave explains, its frequencies, and its ratio, for parts of the frame rate."""
         explained = []
         for part in parts:
-            wave, ratio, offsets = without_tones.strongest(axis, searched, wanted, turns=part * rate * readout)
+            wave, ratio, offsets = without_tones.strongest(axis, searched, mask, turns=part * rate * readout)
             explained.append((offsets**2, wave, wave + part * rate, ratio))
         return explained
 

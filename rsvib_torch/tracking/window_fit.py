@@ -392,17 +392,17 @@ class WindowFit:
         return frequencies, is_resolved, is_visible
 
     def strongest(
-        self, axis: int, frequencies: Array, wanted: NDArray[np.bool_], *, slope: float = 0.0, turns: float = 0.0
+        self, axis: int, frequencies: Array, mask: NDArray[np.bool_], *, slope: float = 0.0, turns: float = 0.0
     ) -> tuple[float, float, float]:
         """The frequency that explains most of an axis, its ratio of variances, and the offsets by it (px rms).
 
-        It is one of those ``wanted`` of evenly spaced frequencies, all of which change by ``slope`` in Hz/s, and whose
+        It is one of those ``mask`` of evenly spaced frequencies, all of which change by ``slope`` in Hz/s, and whose
         phase advances by further ``turns`` from the first to the last row, but not from frame to frame.
         """
         # 1. Means of the offsets along the axis in cells of rows, without those by the other components.
-        others = self.knots.copy()
-        others[axis] = 0.0
-        offsets = (self.corners.offsets - self.explained(others))[:, axis]
+        other_knots = self.knots.copy()
+        other_knots[axis] = 0.0
+        offsets = (self.corners.offsets - self.explained(other_knots))[:, axis]
         row = np.clip(self.corners.rows * _CELLS, 0, _CELLS - 1).astype(np.int64)
         _, cell = np.unique(self.corners.pairs * _CELLS + row, return_inverse=True)
         # Corners far from the median of their cell do not count. The weights of the fit so far would also leave out
@@ -446,10 +446,10 @@ class WindowFit:
         cc, ss, cs, c, s = np.concatenate(parts, -1)[:, : len(frequencies)]
         determinant = cc * ss - cs**2
         size = 0.5 * (cc + ss)  # of what remains of a wave; its phase must be determined as well
-        is_visible = wanted & (size > _MIN_SHARE * size[wanted].max(initial=0.0)) & (determinant > 1e-2 * size**2)
+        is_visible = mask & (size > _MIN_SHARE * size[mask].max(initial=0.0)) & (determinant > 1e-2 * size**2)
         explained = (ss * c**2 - 2 * cs * c * s + cc * s**2) / np.where(is_visible, determinant, np.inf)
         # 4. The highest peak; a maximum at the edge of a band of frequencies belongs to a tone outside of it.
-        inner = wanted[2:] & wanted[:-2] & (explained[1:-1] >= explained[:-2]) & (explained[1:-1] >= explained[2:])
+        inner = mask[2:] & mask[:-2] & (explained[1:-1] >= explained[:-2]) & (explained[1:-1] >= explained[2:])
         explained[1:-1] *= inner
         explained[[0, -1]] = 0.0
         best = int(explained.argmax())
@@ -488,9 +488,9 @@ def fit_window(
     while axes:
         for axis, slope in ((axis, float(slope)) for axis in axes for slope in slopes):
             if (axis, slope) not in peaks:
-                wanted = is_resolved if abs(slope) > _FAST else is_visible
-                wanted = wanted & fit.is_apart(axis, frequencies) & ~left_out[axis]
-                peaks[axis, slope] = fit.strongest(axis, frequencies, wanted, slope=slope)
+                mask = is_resolved if abs(slope) > _FAST else is_visible
+                mask = mask & fit.is_apart(axis, frequencies) & ~left_out[axis]
+                peaks[axis, slope] = fit.strongest(axis, frequencies, mask, slope=slope)
         (axis, slope), (frequency, ratio, offsets) = max(peaks.items(), key=lambda item: item[1][1])
         if ratio < MIN_RATIO or offsets < _MIN_EXPLAINED:
             break

@@ -116,11 +116,11 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         return finished
     with run.folder() as folder:
         resumed = len(folder.records())
-        done = count(1)  # both passes through the video count as half of it each
+        counter = count(1)  # both passes through the video count as half of it each
 
         def progress() -> None:
             if options.progress is not None:
-                options.progress(next(done) // 2, len(frames.starts))
+                options.progress(next(counter) // 2, len(frames.starts))
 
         if options.progress is not None:
             options.progress(0, len(frames.starts))
@@ -137,8 +137,8 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         if isinstance(motion.path, RotationAlignment):
             gyroscope = {name: plain_values(getattr(motion.path, name)) for name in _OF_GYROSCOPE}
         not_kept = metadata_not_kept(job.info, sink, content.shape)
-        stated = {"margins": margins and asdict(margins), "gyroscope": gyroscope, "not_kept": not_kept}
-        with run.writing(folder, **stated) as manifest, whole(sink) as part:
+        fields = {"margins": margins and asdict(margins), "gyroscope": gyroscope, "not_kept": not_kept}
+        with run.writing(folder, **fields) as manifest, whole(sink) as part:
             join_parts(part, content, map(folder.open, folder.files()))
     return run.report(manifest, resumed)
 
@@ -168,16 +168,16 @@ def _check_shaking(folder: RunFolder, *, is_explained: bool) -> None:
 
 def _planned(source: Path, sink: Path, timing: SensorTiming, options: ProcessVideoOptions) -> tuple[VideoFrames, int]:
     """The job of a run with the layout of its frames, and the number of frames to restore at the same time."""
-    given = options.restoration or {}
+    restoration = options.restoration or {}
     for name in _TOGETHER:
-        if given.get(name) is True or given.get(name) not in (None, False, 1):
+        if restoration.get(name) is True or restoration.get(name) not in (None, False, 1):
             raise ValueError(
                 f"{name} must be left out where frames are followed one by one; use process_stack "
                 "(rsvib run without --video)"
             )
-    given = {name: value for name, value in given.items() if name not in _TOGETHER}
+    restoration = {name: value for name, value in restoration.items() if name not in _TOGETHER}
     resources = {name: getattr(options, name) for name in fields_of(ResourceOptions)}
-    job, _, at_once = plan_job(source, timing, StackOptions(restoration=given, window=2, **resources))
+    job, _, at_once = plan_job(source, timing, StackOptions(restoration=restoration, window=2, **resources))
     with closing(open_stack(source)) as reader:
         stored = reader.picture if isinstance(reader, VideoReader) else None
     picture = stored if stored is not None and stored.fits(sink.suffix.lower()) else None

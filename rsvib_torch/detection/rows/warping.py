@@ -243,8 +243,8 @@ def _derivative_filters(reach: int) -> Array:
     filters = []
     for order in (1, 2, 3):
         weight = 1 / (0.3 + angle**order)
-        system, wanted = weight * np.exp(1j * angle * place), (weight * (1j * angle) ** order)[:, 0]
-        parts = np.concatenate([system.real, system.imag]), np.concatenate([wanted.real, wanted.imag])
+        system, target = weight * np.exp(1j * angle * place), (weight * (1j * angle) ** order)[:, 0]
+        parts = np.concatenate([system.real, system.imag]), np.concatenate([target.real, target.imag])
         filters.append(np.linalg.lstsq(*parts)[0])
     return np.stack(filters)
 
