@@ -228,20 +228,20 @@ class SmoothBand:
 
     # (R + b, 2 b + 1, N, 2 Q) real and imaginary parts at Q nodes of systems of R rows, the last b rows are 0; in
     # windows (H + b, 2 b + 1, 2, N W, 2 Q)
-    left: Tensor
+    matrices: Tensor
     prior: Tensor  # (R + b, 2 b + 1, P) matrices whose sum with factors is the precision; (H + b, 2 b + 1, 2, W, P)
     order: int  # of the prior: its matrices have so many diagonals on either side, but 0
     reach: float  # largest distance along the rows in px of the products of kernels
 
     def in_windows(self, windows: list[slice]) -> "SmoothBand":
         """The matrices of all rows as those of windows of rows, eliminated from both ends."""
-        width = self.left.shape[1] // 2
+        width = self.matrices.shape[1] // 2
 
         def halves(values: Tensor) -> Tensor:
             parts = torch.stack([values[window] for window in windows], dim=3).flatten(2, 3)
             return from_both_ends(torch.cat([parts, parts.new_zeros(width, *parts.shape[1:])]))
 
-        return replace(self, left=halves(self.left), prior=halves(self.prior[:, :, None]))
+        return replace(self, matrices=halves(self.matrices), prior=halves(self.prior[:, :, None]))
 
     def at(self, u: Tensor, precision: Tensor) -> Tensor:
         """Halves (H + b, 2 b + 1, 2 n U) of the matrices in windows, complex, at frequencies u (U,) in cycles per px.
@@ -249,8 +249,8 @@ class SmoothBand:
         The ``precision`` are factors (p, q, N, U) of the P = p q matrices of the prior there; those of several priors,
         of all scenes one after the other, make as many matrices of each scene.
         """
-        interpolation = interpolation_matrix(self.reach, u, self.left.dtype)[1]
-        bands = (self.left @ interpolation.to(self.left)).unflatten(-1, (-1, 2))
+        interpolation = interpolation_matrix(self.reach, u, self.matrices.dtype)[1]
+        bands = (self.matrices @ interpolation.to(self.matrices)).unflatten(-1, (-1, 2))
         width, windows = bands.shape[1] // 2, self.prior.shape[3]
         priors = precision.shape[2] * windows // bands.shape[3]
         bands = bands if priors == 1 else bands.repeat(1, 1, 1, priors, 1, 1)

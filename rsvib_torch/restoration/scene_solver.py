@@ -82,7 +82,7 @@ class SceneSolver:
 
         # Chunks of the frequencies; all at a time if their factors are kept. With a quarter of what the memory permits,
         # which caches hold, a pair of 2048 px takes 0.89 of the time.
-        values = scenes * rows * normal.left.shape[1]  # at a frequency
+        values = scenes * rows * normal.matrices.shape[1]  # at a frequency
         most = frequencies if keep else max(1, most_values(device) // (4 * values))
         rounds = -(-frequencies // most)
         chunk = -(-frequencies // (8 * rounds)) * 8  # rows begin at full cache lines
@@ -118,7 +118,7 @@ class SceneSolver:
         return nodes if blur_reach <= 1.5 and 5 * len(nodes) <= len(self.u) else None
 
     def _differentiates(self, *given: Tensor) -> bool:
-        values = (*given, self._normal.left, self.precision)
+        values = (*given, self._normal.matrices, self.precision)
         return torch.is_grad_enabled() and any(value.requires_grad for value in values)
 
     def fit(self, data: Tensor) -> Tensor:

@@ -335,14 +335,14 @@ class WindowFit:
             weighted = root * residual[:, tone.axis]
             tone.jump = self._jump(root, columns[:, 1], -0.5 * root * (early + late).imag, weighted)
             fits = [np.linalg.lstsq(columns[part], weighted[part])[0] for part in parts]
-            tone.apart = max(float(np.hypot(*solution)) for solution in fits)
+            tone.left_in_third = max(float(np.hypot(*solution)) for solution in fits)
 
         def is_kept(tone: WindowTone, wave: NDArray[np.complex128]) -> bool:
-            least = _NEARLY_BLIND if tone.apart > _MAX_APART else _MIN_GAIN
+            least = _NEARLY_BLIND if tone.left_in_third > _MAX_APART else _MIN_GAIN
             is_visible = abs(tone.slope) > _FAST or _gain(tone.frequency, self.interval) > least
             return bool(
                 is_visible
-                and tone.apart < _MOST_APART
+                and tone.left_in_third < _MOST_APART
                 and tone.size > SIGNIFICANT * tone.amplitude_std
                 and 0.5 * np.square(np.abs(wave[:, 1] - wave[:, 0])).mean() > _MIN_EXPLAINED**2
             )

@@ -40,7 +40,7 @@ class WindowTone:
     slope: float = 0.0  # Hz/s, by which the frequency changes
     amplitude_std: float = math.inf  # px
     frequency_std: float = math.inf  # Hz
-    apart: float = 0.0  # largest part of the tone that is left in a third of the rows or columns
+    left_in_third: float = 0.0  # largest part of the tone that is left in a third of the rows or columns
     jump: float = 0.0  # rad, largest significant change of its phase from a frame to the next one that is not followed
 
     @property

@@ -140,7 +140,7 @@ def _findings(timing: SensorTiming, tones: list[Tone], window: WindowPath) -> tu
     findings = []
     for axis, name in enumerate(AXIS_NAMES[:2]):
         of_axis = [tone for tone in tones if tone.axis == axis]
-        apart = max((tone.apart for tone in window.tones if tone.axis == axis), default=0.0)
+        apart = max((tone.left_in_third for tone in window.tones if tone.axis == axis), default=0.0)
         known = any(abs(tone.coefficient) > SIGNIFICANT * tone.amplitude_std for tone in of_axis)
         against = aliases[:1] if known else [Reason("no_tone", name)]
         if axis in largest:

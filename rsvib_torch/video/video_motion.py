@@ -49,7 +49,7 @@ class FirstPass:
 
     def __init__(self, frames: VideoFrames, *, for_gyroscope: bool) -> None:
         self._frames, self._for_gyroscope, self._times = frames, for_gyroscope, frames.middles
-        self.taken = frames.middles  # (N,) s, middle of every frame, and of copies that of the frame before
+        self.exposed = frames.middles  # (N,) s, middle of every frame, and of copies that of the frame before
         self.faults: dict[int, str] = {}  # number of each frame that cannot be used, with the reason
         self.corners: dict[int, Corners] = {}  # between a frame and the next one, of the first frames of each part
         self.compared: dict[int, Array] = {}  # with a gyroscope, likewise, of some frames of the video
@@ -80,7 +80,7 @@ class FirstPass:
         if before is None or changed > _COPY * usual:
             self._waiting.clear()
             return self._used(index, grey, changed)
-        self.taken[index] = self.taken[before[0]]
+        self.exposed[index] = self.exposed[before[0]]
         self._waiting.append((index, grey, changed))
         if len(self._waiting) <= _MOST_IN_A_ROW:
             return ()
@@ -89,7 +89,7 @@ class FirstPass:
 
     def _used(self, index: int, grey: Grey, changed: float) -> tuple[Corners | None, ...]:
         """The corners between a frame that is no copy and the usable frame before, if there is one."""
-        self.taken[index], before = self._times[index], self._before
+        self.exposed[index], before = self._times[index], self._before
         if grey.min() == grey.max():
             self.faults[index] = f"frame {index} is constant"
             return ()
@@ -106,7 +106,7 @@ class FirstPass:
             if index - 1 in self._chosen:
                 self.compared[index - 1] = followed_pair(before[1], grey)
         if corners is not None and self._frames.stabilised:
-            both = np.broadcast_to(self.taken[[before[0], index]], corners.times.shape)
+            both = np.broadcast_to(self.exposed[[before[0], index]], corners.times.shape)
             corners = replace(corners, times=both)
         return (corners,)
 
@@ -128,7 +128,7 @@ class VideoMotion:
 
     frames: VideoFrames  # source, settings, and how frames are restored
     path: CameraPath | RotationAlignment  # of the camera, from corners or by a gyroscope
-    found: FirstPass  # times, faults and corners of the frames
+    first_pass: FirstPass  # times, faults and corners of the frames
     removed: Callable[[int], Vibration | FreeMotion]  # from a frame, the middle of which is the time origin
     is_steady: bool  # whether the frames are moved to a smooth path
 
@@ -139,7 +139,7 @@ class VideoMotion:
         """
         first = number * PART_FRAMES
         indices = range(first, min(first + PART_FRAMES, len(self.frames.starts)))
-        tracks = [FrameTrack(index, self.removed(index), self.found.faults.get(index)) for index in indices]
+        tracks = [FrameTrack(index, self.removed(index), self.first_pass.faults.get(index)) for index in indices]
         shaking = self._shaking(tracks)
         is_worse = any(shakes_more(*both) for both in shaking.values()) if shaking else not self.is_explained(number)
         if not is_worse or not isinstance(self.path, CameraPath):
@@ -153,7 +153,7 @@ class VideoMotion:
 
     def is_explained(self, part: int) -> bool:
         """Whether the path of the camera and tones explain the corners of a part."""
-        path, times = self.path, self.found.taken[part * PART_FRAMES : (part + 1) * PART_FRAMES]
+        path, times = self.path, self.first_pass.exposed[part * PART_FRAMES : (part + 1) * PART_FRAMES]
         return not isinstance(path, CameraPath) or path.nearest(times[len(times) // 2]).residual < path.allowed
 
     def margins(self) -> Margins:
@@ -163,7 +163,7 @@ class VideoMotion:
         """
         widest = np.zeros(4)
         for index in range(len(self.frames.starts)):
-            if index not in self.found.faults:
+            if index not in self.first_pass.faults:
                 timing = self.frames.timing_of(index)
                 (x, y), _ = recorded_offsets(self.removed(index), timing, self.frames.size)
                 x, y = (x, y) if timing.scan_axis == -2 else (x.T, y.T)
@@ -180,7 +180,7 @@ class VideoMotion:
         """
         measured: dict[int, Array] = {}  # (2, 3) px, before and after: x, y and rows, of a frame and the next one
         for pair in pairwise(tracks[:CHECKED_FRAMES]):
-            raw = self.found.corners.get(pair[0].index)
+            raw = self.first_pass.corners.get(pair[0].index)
             if raw is not None:
                 both = shake(raw), shake(self._restored_corners(pair, raw))
                 measured[pair[0].index] = np.array([[*steps, rows] for steps, rows in both])
@@ -198,7 +198,7 @@ class VideoMotion:
         places: list[Array] = []
         for number, track in enumerate(pair):
             exposure = self.frames.timing_of(track.index).exposure_time
-            starts = corners.times[:, number] - self.found.taken[track.index] - 0.5 * exposure
+            starts = corners.times[:, number] - self.first_pass.exposed[track.index] - 0.5 * exposure
             recorded = corners.places + (number - 0.5) * corners.offsets
             places.append(places_at_rest(track.motion, recorded, starts, exposure))
         return replace(corners, places=0.5 * (places[0] + places[1]), offsets=places[1] - places[0])
@@ -209,7 +209,7 @@ class VideoMotion:
         first, last = tracks[0].index, tracks[-1].index
         detection = None
         if isinstance(path, CameraPath):
-            detection = part_detection(self.frames, path, self.found.taken, slice(first, last + 1))
+            detection = part_detection(self.frames, path, self.first_pass.exposed, slice(first, last + 1))
         reasons = []
         if detection is not None and not self.is_steady:  # the rows of axes without tones are not moved
             reasons = [
@@ -257,15 +257,16 @@ def video_motion(
     if rates is None:
         with ONE_BLAS_THREAD:
             path = camera_path(first_pass.pairs(progress), timing, frames.size, has_tones=not frames.stabilised)
-        places = path.places(first_pass.taken)
+        places = path.places(first_pass.exposed)
         _check_repetitions(first_pass.repetitions, places[:, :2])
         shift = to_steady(places)
-        polynomials = np.stack([path.derivatives(first_pass.taken, 1), path.derivatives(first_pass.taken, 2), shift], 1)
+        derivatives = (path.derivatives(first_pass.exposed, order) for order in (1, 2))
+        polynomials = np.stack([*derivatives, shift], 1)
         polynomials[:, :2] *= not frames.stabilised
 
         def by_corners(index: int) -> Vibration:
             """The tones, skew and wobble by the path, and what the path is not smooth by."""
-            tones, polynomial = path.tones(float(first_pass.taken[index])), polynomials[index]
+            tones, polynomial = path.tones(float(first_pass.exposed[index])), polynomials[index]
             if options.steady == 0:  # axes without vibration stay as taken
                 polynomial = polynomial * np.array([any(tone.axis == axis for tone in tones) for axis in range(4)])
             amplitude, frequency, phase, *_ = tone_tables(tones, 4)
@@ -278,7 +279,7 @@ def video_motion(
     if not aligned.reliable:
         reasons = "; ".join(aligned.reasons)
         raise ValueError(f"the gyroscope ({rates.source}) does not fit the video: {reasons}")
-    rotation = RecordedRotation.aligned(rates, aligned, first_pass.taken)
+    rotation = RecordedRotation.aligned(rates, aligned, first_pass.exposed)
     turned = to_steady(rotation.path, rotation.of_frames)
     half = timing.time_to_middle(frames.size[int(timing.scan_axis)])
     return VideoMotion(

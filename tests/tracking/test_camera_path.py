@@ -207,7 +207,7 @@ def test_a_vibration_of_the_zoom_is_no_tone_along_x():
     """Off-centre corners showed zoom of 6e-3 as 0.42 +- 0.004 px along x, reliable, where the camera does not move."""
     frames = recorded({}, subject=False, zoom=(0.006, 64.0))
     tones = fitted(frames)[1].windows[0].tones
-    assert all(tone.axis == 1 and tone.apart > 0.25 for tone in tones)  # refused: the halves move apart
+    assert all(tone.axis == 1 and tone.left_in_third > 0.25 for tone in tones)  # refused: the halves move apart
 
 
 # a wobble in px of corners that move by themselves: other readouts are tried

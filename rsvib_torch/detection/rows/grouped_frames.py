@@ -47,7 +47,7 @@ class MeasuredRows:
     gradients: list[RowGradients]  # gradients of the scene, for further rounds
     # (B, N, 2) px^2, mean square difference of the displacements of strips from these components, less that by noise;
     # None if rows were measured as a whole
-    apart: Array | None = None
+    excess: Array | None = None
 
     @property
     def num_stacks(self) -> int:
@@ -60,18 +60,18 @@ class MeasuredRows:
         for part in self.gradients:
             of_groups = np.arange(len(part.variance)).reshape(self.num_stacks, -1)[stacks].ravel()
             gradients.append(part.stacks(tensor(of_groups).to(part.variance.device)))
-        apart = None if self.apart is None else self.apart[stacks]
-        return MeasuredRows(take_stacks([self.measurements], stacks), gradients, apart)
+        excess = None if self.excess is None else self.excess[stacks]
+        return MeasuredRows(take_stacks([self.measurements], stacks), gradients, excess)
 
     def differential(self) -> Array:
         """(B, 2) px, rms difference of the displacements along a row that the components do not explain."""
-        if self.apart is None:
+        if self.excess is None:
             return differential_motion(self.gradients, self.num_stacks)
-        return np.sqrt(np.maximum(trimmed_mean(self.apart), 0.0))
+        return np.sqrt(np.maximum(trimmed_mean(self.excess), 0.0))
 
     def uneven(self) -> Array:
         """(B, 2) px, the part of the differences along a row that roll and zoom cannot explain."""
-        if self.apart is None:
+        if self.excess is None:
             return uneven_motion(self.gradients, self.num_stacks)
         return self.differential()
 
@@ -106,7 +106,7 @@ class GroupedFrames:
             parts.append(part)
             of_groups.append(of_part if keep_images else of_part.without_images())
             advance(group.count)
-        return MeasuredRows(joined_groups(parts, self.timing.exposure_time, count), of_groups, self.apart(of_groups))
+        return MeasuredRows(joined_groups(parts, self.timing.exposure_time, count), of_groups, self.excess(of_groups))
 
     def measure_group(
         self, group: FrameGroups, motion: Motion, view: Motion, gradients: RowGradients | None
@@ -114,8 +114,8 @@ class GroupedFrames:
         """``displacements.measure_group`` around a motion, which the measured stacks have the ``view`` of."""
         return measure_group(group, self.timing, view, gradients)
 
-    def apart(self, gradients: list[RowGradients]) -> Array | None:
-        """``MeasuredRows.apart``."""
+    def excess(self, gradients: list[RowGradients]) -> Array | None:
+        """``MeasuredRows.excess``."""
         return None
 
     def view(self, motion: Vibration | FreeMotion) -> Motion:
@@ -206,8 +206,8 @@ class GroupedStrips(GroupedFrames):
         """Components (B, N, G, A) of the motion of the rows of a group."""
         return measure_strips(group, self.timing, motion, view, self.strips, self.scale.factors, gradients)
 
-    def apart(self, gradients: list[RowGradients]) -> Array:
-        """``MeasuredRows.apart``."""
+    def excess(self, gradients: list[RowGradients]) -> Array:
+        """``MeasuredRows.excess``."""
         excesses = []
         for of_group in gradients:
             residual, noise, regular = displacements_of_parts(of_group)
