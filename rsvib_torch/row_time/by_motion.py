@@ -115,7 +115,7 @@ def calibrate_row_time_by_motion(frames: FramesOrFiles, options: RowTimeOptions)
             agreeing, reasons = row_times_of_tones(stack, clock, options)
         reasons += [] if agreeing else [Reason("no_motion_for_row_time")]
     if len(agreeing) > 1:
-        listed = ", ".join(f"{1e6 * one.row_time:.4f}" for one in agreeing[1:9])
+        listed = ", ".join(f"{1e6 * candidate.row_time:.4f}" for candidate in agreeing[1:9])
         details: dict[str, float | str] = {"row_time": 1e6 * agreeing[0].row_time, "others": listed}
         reasons.append(Reason("row_times_ambiguous", None, len(agreeing), 1, details))
     row_time, std = (abs(agreeing[0].row_time), agreeing[0].std) if agreeing else (None, None)
@@ -133,7 +133,7 @@ def calibrate_row_time_by_motion(frames: FramesOrFiles, options: RowTimeOptions)
         frame_rows=None if row_time is None else period / row_time,
         readout_direction=directions.pop() if len(directions) == 1 else None,
         notes=notes if options.row_time is None else (),
-        candidates=tuple(sorted(one.row_time for one in agreeing)),
+        candidates=tuple(sorted(candidate.row_time for candidate in agreeing)),
         reliable=not reasons,
         findings=reasons_from_row_order(tuple(reasons), sensor),
     )

@@ -109,7 +109,7 @@ class _MeasuredRows:
 
     def residual(self, tones: list["_Tones"]) -> Array:
         """(1, N, G, 2) px, displacements without those by the tones of both axes."""
-        return self.measurements.displacements - np.stack([self.model(one.values)[0] for one in tones], -1)
+        return self.measurements.displacements - np.stack([self.model(fit.values)[0] for fit in tones], -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +171,7 @@ def _peaks(rows: _MeasuredRows, axis: int, residual: Array, highest: float, coun
     return [(float(nu[i]), float(phi[j])) for i, j in zip(*np.unravel_index(best, power.shape), strict=True)]
 
 
-def _found(rows: _MeasuredRows, axis: int, highest: float, share: float, known: Array) -> _Tones:
+def _with_further_tones(rows: _MeasuredRows, axis: int, highest: float, share: float, known: Array) -> _Tones:
     """Known tones (4 K + 1,) of an axis, and further ones while they are significant, up to ``highest`` cycles per row.
 
     A further tone must explain a ``share`` of the residual.
@@ -194,10 +194,10 @@ def _found(rows: _MeasuredRows, axis: int, highest: float, share: float, known: 
 
 def _motion(tones: list[_Tones], timing: RowTiming, num_frames: int, num_rows: int) -> Vibration:
     """The motion (1, 2, K) on the clock of the rows, on which phi continues from frame to frame."""
-    parameters = np.zeros((2, 3 * max(1, *(len(one.tones) for one in tones)) + 3))
-    for one, of_axis in zip(tones, parameters, strict=True):
-        amplitude, frequency, phase = of_axis[:-3].reshape(3, -1)[:, : len(one.tones)]
-        real, imaginary, nu, phi = one.tones.T
+    parameters = np.zeros((2, 3 * max(1, *(len(fit.tones) for fit in tones)) + 3))
+    for fit, of_axis in zip(tones, parameters, strict=True):
+        amplitude, frequency, phase = of_axis[:-3].reshape(3, -1)[:, : len(fit.tones)]
+        real, imaginary, nu, phi = fit.tones.T
         frequency[:] = phi + np.round(nu * _FRAME_ROWS - phi)
         # The mean over an exposure that begins with a row is that of its middle, times a sinc.
         within = frequency * timing.exposure_time
@@ -205,15 +205,15 @@ def _motion(tones: list[_Tones], timing: RowTiming, num_frames: int, num_rows: i
         coefficient = (real + 1j * imaginary) / np.where(np.abs(sinc) < _MIN_SINC, np.inf, sinc)
         turns = nu * 0.5 * (num_rows - 1) + phi * 0.5 * (num_frames - 1) + 0.5 * within
         amplitude[:], phase[:] = np.abs(coefficient), np.angle(coefficient) + 0.5 * math.pi - 2 * math.pi * turns
-        of_axis[-3] = one.values[-1]
+        of_axis[-3] = fit.values[-1]
     return Vibration.from_parameters(tensor(parameters[None]))
 
 
 def candidates(tones: list[_Tones], clock: CameraClock) -> list[Candidate]:
     """All possible row times that are a local minimum of chi-square, the best first."""
-    nu, phi = np.concatenate([one.tones[:, 2:] for one in tones]).T
+    nu, phi = np.concatenate([fit.tones[:, 2:] for fit in tones]).T
     of_nu, mixed, of_phi = (
-        block_diag(*(one.covariance[i:-1:4, j:-1:4] for one in tones)) for i, j in ((2, 2), (2, 3), (3, 3))
+        block_diag(*(fit.covariance[i:-1:4, j:-1:4] for fit in tones)) for i, j in ((2, 2), (2, 3), (3, 3))
     )
 
     # 1. Values of P / T_row with which a tone has a whole number of further turns per frame.
@@ -241,10 +241,11 @@ def candidates(tones: list[_Tones], clock: CameraClock) -> list[Candidate]:
 
     # 3. Different ones that are possible.
     possible: list[Candidate] = []
-    for one in map(Candidate, row_times.tolist(), stds.tolist(), chi_square.tolist()):
-        is_known = any(abs(one.row_time - other.row_time) < 1e-3 * one.std + 1e-9 * clock.high for other in possible)
-        if clock.allows(one.row_time) and not is_known:
-            possible.append(one)
+    for candidate in map(Candidate, row_times.tolist(), stds.tolist(), chi_square.tolist()):
+        least = 1e-3 * candidate.std + 1e-9 * clock.high
+        is_known = any(abs(candidate.row_time - other.row_time) < least for other in possible)
+        if clock.allows(candidate.row_time) and not is_known:
+            possible.append(candidate)
     return sorted(possible, key=lambda candidate: candidate.chi_square)
 
 
@@ -262,8 +263,8 @@ def row_times_of_tones(
     curve = band_curve(stack.images, stack.valid, timing, options, mere_start=True)
     bands = _MeasuredRows.of(measurements_of_curve(curve, timing, options.band_step), num_frames, num_rows, 0.0)
     highest = 0.5 / options.band_step
-    tones = [_found(bands, axis, highest, _SHARE_OF_BANDS, np.zeros(1)) for axis in range(2)]
-    possible = candidates(tones, clock) if any(len(one.tones) for one in tones) else []
+    tones = [_with_further_tones(bands, axis, highest, _SHARE_OF_BANDS, np.zeros(1)) for axis in range(2)]
+    possible = candidates(tones, clock) if any(len(fit.tones) for fit in tones) else []
     if not possible:
         return [], []
 
@@ -286,8 +287,10 @@ def row_times_of_tones(
         rows = replace(rows, measurements=rows.measurements.weighed(rows.residual(tones)))
         before = tones
         tones = [
-            _found(rows, axis, highest, _SHARE_OF_ROWS, one.values) if number > 1 else _fitted(rows, axis, one.values)
-            for axis, one in enumerate(tones)
+            _with_further_tones(rows, axis, highest, _SHARE_OF_ROWS, fit.values)
+            if number > 1
+            else _fitted(rows, axis, fit.values)
+            for axis, fit in enumerate(tones)
         ]
         possible = candidates(tones, clock)
         if not possible:
@@ -318,7 +321,7 @@ def _is_converged(before: _Tones, after: _Tones) -> bool:
 def _findings(rows: _MeasuredRows, tones: list[_Tones], differential: Array) -> list[Reason]:
     """Reasons against tones, and with them against their row time."""
     residual, measured, reasons = rows.residual(tones), rows.measurements, list[Reason]()
-    of_tones = [replace(one, values=np.append(one.values[:-1], 0.0)) for one in tones]
+    of_tones = [replace(fit, values=np.append(fit.values[:-1], 0.0)) for fit in tones]
     other = OtherMotion.of(measured, measured.displacements - rows.residual(of_tones), residual, differential)
     quantities = {**vars(other), "permitted": other.permitted}
     for axis, name in enumerate(AXIS_NAMES[:2]):
