@@ -228,8 +228,7 @@ class CalibrateOptions:
 def calibrate(command: CalibrateOptions) -> Answer:
     """Measure the row time with a flickering light, or row time and readout direction with motion.
 
-    With --by-motion, a row time that is not certain is refused with the
-    reason.
+    With --by-motion, a row time that is not certain is refused with the reason.
     """
     # 1. The frames, and what is known of them.
     paths, out = command.frames, command.out
