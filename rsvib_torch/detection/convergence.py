@@ -43,9 +43,9 @@ def is_converged(previous: ToneFit, fit: ToneFit) -> Array:
     """
     if previous.active.shape != fit.active.shape:
         return np.zeros_like(fit.active[..., 0])
-    deviation = fit.covariance.diagonal(axis1=-2, axis2=-1)
-    deviation = np.sqrt(np.maximum(split_axis(deviation, -1, fit.coefficients.shape[1], -1), 0.0))
-    std = split_axis(deviation[..., : 3 * fit.frequencies.shape[-1]], -1, -1, 3)  # of Re C, Im C and f
+    variance = split_axis(fit.covariance.diagonal(axis1=-2, axis2=-1), -1, fit.coefficients.shape[1], -1)
+    std = np.sqrt(np.maximum(variance[..., : 3 * fit.frequencies.shape[-1]], 0.0))
+    std = split_axis(std, -1, -1, 3)  # of Re C, Im C and f
     change = np.abs(previous.about(fit.centre).coefficients - fit.coefficients)
     same_frequency = np.abs(previous.frequencies - fit.frequencies) <= _SMALL_CHANGE * std[..., 2]
     small = (change <= _SMALL_CHANGE * std[..., :2].max(-1)) & same_frequency
@@ -82,8 +82,8 @@ class Acceleration:
         # the combination of differences of changes that is nearest to the last change, (B, n, M) for M differences
         changes = [(after.change - before.change).reshape(len(fitted), -1) for before, after in pairs]
         change = np.stack(changes, -1)
-        gram, right = change.mT @ change, change.mT @ self.steps[-1].change.reshape(len(fitted), -1, 1)
-        ridge = 1e-3 * np.maximum(gram.diagonal(axis1=-2, axis2=-1).mean(-1), 1e-30)
-        share = np.linalg.solve(gram + ridge[:, None, None] * np.eye(len(pairs)), right)[..., 0]
+        normal, right_side = change.mT @ change, change.mT @ self.steps[-1].change.reshape(len(fitted), -1, 1)
+        ridge = 1e-3 * np.maximum(normal.diagonal(axis1=-2, axis2=-1).mean(-1), 1e-30)
+        share = np.linalg.solve(normal + ridge[:, None, None] * np.eye(len(pairs)), right_side)[..., 0]
         share = np.clip(share, -_MAX_EXTRAPOLATION, _MAX_EXTRAPOLATION)
         return (fitted * share[:, None, None, None]).sum(-1)

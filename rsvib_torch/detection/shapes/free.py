@@ -319,7 +319,7 @@ def _bands_reasons(start: BandStart, columns: int, motion: Motion, axes: int) ->
     found = banded.weights[0].min(-1).reshape(pairs) > 0
     bands = compared_bands(np.where(found[..., None], offsets, np.nan), offsets - rest, np.ones_like(found))
     left, spread = np.nanmax(bands["residual"], 0), np.nanmean(bands["size"], 0)
-    against, allowed = scene_reasons(start.curve, columns, of_pairs=True)[0], np.maximum(_MAX_BAND_ERROR, 0.3 * spread)
+    against, allowed = scene_reasons(start.curve, columns, by_pair=True)[0], np.maximum(_MAX_BAND_ERROR, 0.3 * spread)
     excess = left / allowed
     contradicted = {
         name: Reason("bands_contradict", name, float(left[axis]), float(allowed[axis]))
