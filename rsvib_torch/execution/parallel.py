@@ -133,11 +133,11 @@ def in_parallel(
         # a new pool each time, because a kept one would not survive a fork; this thread takes part, because the C
         # library keeps the memory that it frees for the next call, but may return that of other threads
         with ThreadPoolExecutor(threads - 1) as pool:
-            others = [pool.submit(take_part) for _ in range(threads - 1)]
-            made = take_part()
+            futures = [pool.submit(take_part) for _ in range(threads - 1)]
+            own_results = take_part()
     finally:
         torch.set_num_threads(within)  # the initial value of threads that are started later
-    results = dict(chain(made, *(other.result() for other in others)))
+    results = dict(chain(own_results, *(future.result() for future in futures)))
     return [results[place] for place in range(len(items))]
 
 
@@ -162,8 +162,8 @@ def prefetched(items: Generator[Item, None, None], count: int, threads: int = 1)
     """
     with _pool(1, threads, items) as pool:
         waiting = deque(pool.submit(list, islice(items, 1)) for _ in range(count + 1))
-        while made := waiting.popleft().result():  # empty if there are no further items
-            yield made[0]
+        while item := waiting.popleft().result():  # empty if there are no further items
+            yield item[0]
             waiting.append(pool.submit(list, islice(items, 1)))
 
 

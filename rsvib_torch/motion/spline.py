@@ -134,8 +134,8 @@ class FreeMotion(
         from scipy.interpolate import CubicSpline  # noqa: PLC0415
 
         grid, values = as_numbers("times", times).cpu(), as_numbers("displacement", displacement).cpu()
-        for name, given in (("times", grid), ("displacement", values)):
-            if given.requires_grad:
+        for name, value in (("times", grid), ("displacement", values)):
+            if value.requires_grad:
                 remedy = f"pass {name}.detach(), or evenly spaced times to through"
                 raise ValueError(f"from_samples has no gradient: {remedy}")
         _check_samples(grid, values)
@@ -154,8 +154,8 @@ class FreeMotion(
         """Duration and range of the motion; of a batch, those of each motion."""
         count = self.coefficients.shape[-1] - 2
         times = torch.linspace(self.start, self.end, 4 * count, dtype=torch.float64, device=self.device)
-        moved = self.displacement(times.expand(*self.batch_shape, -1)).detach()
-        low, high = moved.amin(-2), moved.amax(-2)
+        displacement = self.displacement(times.expand(*self.batch_shape, -1)).detach()
+        low, high = displacement.amin(-2), displacement.amax(-2)
         rows = [
             [*labels, measured_text(low[at]), measured_text(high[at])]
             for at, labels in axis_rows(self.batch_shape, self.num_axes)
@@ -186,8 +186,8 @@ class FreeMotion(
             phase=old.phase + 2 * math.pi * old.frequency * offset,
             image_motion=old.image_motion + old.image_acceleration * offset,
         )
-        moved = old.image_motion * offset + 0.5 * old.image_acceleration * offset**2
-        return replace(self, coefficients=self.coefficients + moved[..., None], start=self.start - offset, tones=tones)
+        shift = old.image_motion * offset + 0.5 * old.image_acceleration * offset**2
+        return replace(self, coefficients=self.coefficients + shift[..., None], start=self.start - offset, tones=tones)
 
     def within(self, first: float, last: float) -> "FreeMotion":
         """The motion between two times in seconds, without the knots that have no influence there."""

@@ -163,8 +163,8 @@ class SensorTiming:
         row_time = check_number("row_time", row_time, above=0.0)
         exposure = check_number("exposure_time", exposure_time, above=0.0)
         period = 1 / check_number("frame_rate", frame_rate, above=0.0)
-        others = scan_axis, readout_direction, frame_start_times, row_time_std
-        return cls(row_time, exposure / row_time, period / row_time, *others)
+        settings = scan_axis, readout_direction, frame_start_times, row_time_std
+        return cls(row_time, exposure / row_time, period / row_time, *settings)
 
     @staticmethod
     def from_file(path: str | os.PathLike[str]) -> SensorTiming:
@@ -178,8 +178,8 @@ class SensorTiming:
             29.97
         """
         data = read_toml(Path(path))
-        stated = {name: table for name, table in data.items() if name == "sensor"}
-        section: SensorSection = validate(_SensorFile, stated, str(path)).sensor
+        sections = {name: table for name, table in data.items() if name == "sensor"}
+        section: SensorSection = validate(_SensorFile, sections, str(path)).sensor
         return section.to_timing()
 
     @property
@@ -395,8 +395,8 @@ def other_intervals(timing: SensorTiming | RowTiming, starts: Tensor, num_rows: 
 
 def contradiction(timing: SensorTiming | RowTiming, starts: Tensor, num_rows: int) -> str:
     """Sentence about starts of frames whose intervals are all far from the frame period; empty if they are not."""
-    least, most = other_intervals(timing, starts, num_rows) or (timing.frame_period, timing.frame_period)
-    if 0.9 * least <= timing.frame_period <= most / 0.9:
+    shortest, longest = other_intervals(timing, starts, num_rows) or (timing.frame_period, timing.frame_period)
+    if 0.9 * shortest <= timing.frame_period <= longest / 0.9:
         return ""
     return (
         f"by their times, frames are {float(starts.diff().median()):.3g} s apart, but the frame period is "

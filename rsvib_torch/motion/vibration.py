@@ -55,10 +55,10 @@ def _per_tone(values: dict[str, TensorLike], device: torch.device | None) -> lis
             continue
         count = tensors[name].shape[-2]
         if not 2 <= count <= 4 or tensors[name].shape[-1] == 0 or axes not in (0, count):
-            others = "" if axes in (0, count) else f"; the other values have {axes} axes"
+            counts = "" if axes in (0, count) else f"; the other values have {axes} axes"
             raise ValueError(
                 f"{name} must have shape (2,), (2, K) or (..., 2, K) for axes (x, y), with 3 for (x, y, roll) and 4 "
-                f"for (x, y, roll, zoom), got {tuple(tensor.shape)}{others}"
+                f"for (x, y, roll, zoom), got {tuple(tensor.shape)}{counts}"
             )
         axes = count
     return [tensor.expand(axes or 2, 1) if tensor.ndim == 0 else tensor for tensor in tensors.values()]
@@ -152,11 +152,11 @@ class Vibration(
         image_shift: TensorLike = (0.0, 0.0),
         camera: Camera | None = None,
     ) -> None:
-        given = (amplitude, frequency, phase, image_motion, image_acceleration, image_shift)
-        device = next((value.device for value in given if isinstance(value, Tensor)), None)
+        inputs = (amplitude, frequency, phase, image_motion, image_acceleration, image_shift)
+        device = next((value.device for value in inputs if isinstance(value, Tensor)), None)
         tones = _per_tone({"amplitude": amplitude, "frequency": frequency, "phase": phase}, device)
         axes = tones[0].shape[-2]
-        polynomial = [_per_axis(name, value, axes, device) for name, value in zip(_POLYNOMIAL, given[3:], strict=True)]
+        polynomial = [_per_axis(name, value, axes, device) for name, value in zip(_POLYNOMIAL, inputs[3:], strict=True)]
         try:
             tones = list(torch.broadcast_tensors(*tones))
             # torch.broadcast_shapes takes 40 us, and its first call imports sympy (0.3 s)
@@ -191,8 +191,8 @@ class Vibration(
         then image motion, image acceleration and image shift.
         """
         tones = (parameters.shape[-1] - 3) // 3
-        *of_tones, polynomial = parameters.split([tones, tones, tones, 3], -1)
-        values = dict(zip(_LIMITS, (*of_tones, *polynomial.unbind(-1)), strict=True))
+        *tone_values, polynomial = parameters.split([tones, tones, tones, 3], -1)
+        values = dict(zip(_LIMITS, (*tone_values, *polynomial.unbind(-1)), strict=True))
         return cls.__new__(cls)._changed(**values, camera=None)
 
     @property
@@ -204,10 +204,11 @@ class Vibration(
     @classmethod
     def _of_equal_shapes(cls, results: Sequence[Self]) -> Sequence[Self]:
         """Vibrations with as many tones as the one with most; missing tones have amplitude 0."""
-        missing = [max(other.amplitude.shape[-1] for other in results) - one.amplitude.shape[-1] for one in results]
+        most_tones = max(result.amplitude.shape[-1] for result in results)
+        missing = [most_tones - result.amplitude.shape[-1] for result in results]
         return [
-            one._changed(**{name: functional.pad(getattr(one, name), (0, tones)) for name in _QUANTITIES})
-            for one, tones in zip(results, missing, strict=True)
+            result._changed(**{name: functional.pad(getattr(result, name), (0, tones)) for name in _QUANTITIES})
+            for result, tones in zip(results, missing, strict=True)
         ]
 
     def scaled(self, factor: Tensor | float) -> "Vibration":
@@ -433,7 +434,7 @@ def blind_frequencies(timing: SensorTiming, highest: float) -> Tensor:
     def multiples(interval: float) -> Tensor:
         return torch.arange(1, math.floor(highest * interval) + 1, dtype=torch.float64, device="cpu") / interval
 
-    alike = multiples(float(intervals[0])) if len(intervals) else starts[:0]
-    cycles = alike[:, None] * intervals
-    alike = alike[((cycles - cycles.round()).abs() < 1e-6).all(-1)]  # whole cycles to the rounding of the start times
-    return torch.cat([alike, multiples(timing.exposure_time)]).unique(sorted=True)
+    blind = multiples(float(intervals[0])) if len(intervals) else starts[:0]
+    cycles = blind[:, None] * intervals
+    blind = blind[((cycles - cycles.round()).abs() < 1e-6).all(-1)]  # whole cycles to the rounding of the start times
+    return torch.cat([blind, multiples(timing.exposure_time)]).unique(sorted=True)

@@ -124,14 +124,14 @@ def tables(*values: Tensor) -> list[Array]:
 
 def take_stacks(parts: Sequence[Stacks], index: Array) -> Stacks:
     """The stacks ``index`` of several dataclasses behind each other; values without a batch are those of the first."""
-    taken = {}
+    arrays = {}
     for field in fields(parts[0]):
         values = [getattr(part, field.name) for part in parts]
         if isinstance(values[0], np.ndarray):
-            taken[field.name] = (np.concatenate(values) if len(values) > 1 else values[0])[index]
+            arrays[field.name] = (np.concatenate(values) if len(values) > 1 else values[0])[index]
         elif is_dataclass(values[0]):
-            taken[field.name] = take_stacks(values, index)
-    return replace(parts[0], **taken)
+            arrays[field.name] = take_stacks(values, index)
+    return replace(parts[0], **arrays)
 
 
 def select_stacks(where: Array, one: Stacks, other: Stacks) -> Stacks:
