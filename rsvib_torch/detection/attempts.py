@@ -184,7 +184,7 @@ def _without_parallax(stacks: GreyFrames, timing: RowTiming, options: DetectionO
     findings = list(previous.findings)
     for index, against in enumerate(previous.findings):
         # 1. Stacks that are refused along an axis for this reason only.
-        if not any({reason.code for reason in of_axis} == {"halves_apart"} for of_axis in against):
+        if not any({reason.code for reason in reasons} == {"halves_apart"} for reasons in against):
             continue
         # 2. Each half must be reliable along both axes, with the displacements of the whole.
         stack = stacks.one(index)
@@ -197,7 +197,7 @@ def _without_parallax(stacks: GreyFrames, timing: RowTiming, options: DetectionO
                 break
         else:
             findings[index] = tuple(
-                tuple(reason for reason in of_axis if reason.code != "halves_apart") for of_axis in against
+                tuple(reason for reason in reasons if reason.code != "halves_apart") for reasons in against
             )
     return replace(previous, findings=tuple(findings))
 

@@ -80,8 +80,7 @@ class Acceleration:
         pairs = list(itertools.pairwise(self.steps))
         fitted = np.stack([after.fitted - before.fitted for before, after in pairs], -1)
         # the combination of differences of changes that is nearest to the last change, (B, n, M) for M differences
-        changes = [(after.change - before.change).reshape(len(fitted), -1) for before, after in pairs]
-        change = np.stack(changes, -1)
+        change = np.stack([(after.change - before.change).reshape(len(fitted), -1) for before, after in pairs], -1)
         normal, right_side = change.mT @ change, change.mT @ self.steps[-1].change.reshape(len(fitted), -1, 1)
         ridge = 1e-3 * np.maximum(normal.diagonal(axis1=-2, axis2=-1).mean(-1), 1e-30)
         share = np.linalg.solve(normal + ridge[:, None, None] * np.eye(len(pairs)), right_side)[..., 0]

@@ -68,8 +68,7 @@ class Measurements:
         """(2, 1, A, 1) seconds over which displacements are averages: the exposure, the rows of a band."""
         axes = self.displacements.shape[-1]
         along, across = self.average_times
-        times = [[self.exposure_time] * axes, [along, across, along, along][:axes]]
-        return np.array(times)[:, None, :, None]
+        return np.array([[self.exposure_time] * axes, [along, across, along, along][:axes]])[:, None, :, None]
 
     @cached_property
     def drifts(self) -> Array:
@@ -299,8 +298,7 @@ class OtherMotion:
         visible = measurements.num_differences > 0
         # sqrt(2): from the rms displacement about the mean of the frames to the offset of two of them
         size = math.sqrt(2) * np.sqrt(valid_mean(np.square(measurements.distances(by_tones)), 1))
-        is_large = (size[..., :2] > _FAR).any(-1, keepdims=True)
-        min_weight = np.where(is_large, _VAGUE**-2, 0.0)[..., None]
+        min_weight = np.where((size[..., :2] > _FAR).any(-1, keepdims=True), _VAGUE**-2, 0.0)[..., None]
         measured = visible & (measurements.weights[..., :2] > min_weight).all(-1)
         counts = (split_axis(rows, 1, measurements.groups, -1).sum(2) for rows in (measured, visible))
         num_measured, num_visible = counts

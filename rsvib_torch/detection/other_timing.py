@@ -184,8 +184,7 @@ def _with_starts(
     if frequencies is None:
         interval = max(BLOCK_ROWS * timing.row_time, 0.5 * timing.exposure_time)
         return trial, find_tones(trial, interval, 1, stretches=False, iterations=_ITERATIONS)
-    active = np.ones_like(frequencies, dtype=bool)
-    return trial, robust_fit(trial, frequencies, active, iterations=_ITERATIONS)[0]
+    return trial, robust_fit(trial, frequencies, np.ones_like(frequencies, dtype=bool), iterations=_ITERATIONS)[0]
 
 
 _ROWS = (32, 128)  # measured rows that are used in the search and its refinement; more rows take longer only

@@ -219,5 +219,4 @@ def offset_curve(
         "std": np.sqrt(np.where(weights > 0, 2.0 * robust / np.maximum(weights, 1e-300), np.nan)),  # of a difference
     }
     on_device = {name: torch.from_numpy(array).to(device) for name, array in values.items()}
-    curve = OffsetCurve(**on_device, heights=(BLOCK_ROWS, BLOCK_ROWS))
-    return curve, fitted_after - fitted_before
+    return OffsetCurve(**on_device, heights=(BLOCK_ROWS, BLOCK_ROWS)), fitted_after - fitted_before

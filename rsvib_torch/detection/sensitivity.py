@@ -81,8 +81,7 @@ def timing_sensitivity(fit: ToneFit, timing: RowTiming, num_frames: int, num_row
     largest_first = (-fit.amplitude).argsort(-1, stable=True)
     size = np.where(fit.amplitude > 1e-9, fit.amplitude, 1.0)  # px or rad; a tone that has decayed does not count
     for name in ("row_time", "frame_rows", "exposure_rows"):
-        declared = getattr(timing, name)
-        timings = [replace(timing, **{name: declared * (1 + sign * _STEP)}) for sign in (-1, 1)]
+        timings = [replace(timing, **{name: getattr(timing, name) * (1 + sign * _STEP)}) for sign in (-1, 1)]
         lower, higher = (model_displacements(record(changed_timing), fit) for changed_timing in timings)
         change = (higher - lower) / (2 * _STEP)
         parameter_changes = -inverses @ np.moveaxis(change, -1, 1).reshape(batch, axes, -1, 1)

@@ -183,8 +183,7 @@ def _spectrum(measured: Measurements, frequency: Array, known_lines: Array) -> t
     times, weights = measured.middles[..., 0, 0], measured.weights[..., 0]  # (1, N, 2), (1, N)
     # Response of an offset to a displacement of each frequency, and its sum over the offsets.
     attenuation = np.sinc(frequency * measured.smearing_times[:, 0]).prod(0)[0]
-    intervals = fourier_sums(np.diff(times), weights[..., None], grid)[0]
-    energy = 2 * (weights.sum() - intervals.real)
+    energy = 2 * (weights.sum() - fourier_sums(np.diff(times), weights[..., None], grid)[0].real)
     energy = np.maximum(energy, 1e-12 * energy.max())
     response = np.abs(attenuation) * np.sqrt(energy)
     visible, shown = (response >= gain * response.max() for gain in (_BLIND_GAIN, _SEARCHED_GAIN))

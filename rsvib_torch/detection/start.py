@@ -73,8 +73,7 @@ class FieldScale:
     def std(self, fitted: VibrationStd) -> VibrationStd:
         """The same for standard deviations."""
         factor = self.units(fitted.amplitude)
-        names = ("image_motion", "image_acceleration", "displacement")
-        values = {name: getattr(fitted, name) for name in names}
+        values = {name: getattr(fitted, name) for name in ("image_motion", "image_acceleration", "displacement")}
         scaled = {name: value * factor for name, value in values.items() if value is not None}
         return replace(fitted, amplitude=fitted.amplitude * factor[:, None], **scaled)
 
@@ -122,8 +121,7 @@ def combined_strips(measured: Measurements, factors: Array) -> Measurements:
     # 3. Their solution; fewer than two strips with detail do not determine roll.
     values, vectors = np.linalg.eigh(np.where((size > 0).all(-1)[..., None, None], normal, 0.0))
     regular = values[..., 0] > 1e-6
-    solvable = np.where(regular[..., None], values, 1.0)
-    inverse = (vectors / solvable[..., None, :]) @ vectors.mT  # (B, N, A, A)
+    inverse = (vectors / np.where(regular[..., None], values, 1.0)[..., None, :]) @ vectors.mT  # (B, N, A, A)
     unit = unit[:, :, None]
     components = np.where(regular[:, :, None, None], ((right_side * unit) @ inverse) * unit, 0.0)
     return Measurements(

@@ -207,8 +207,7 @@ def blur_rows(scene: Tensor, psf: RowPSF) -> Tensor:
         index = _gather_index(psf, tap, size)
         pixels = flat.gather(-1, index.flatten(-2).expand(*lead, -1)).unflatten(-1, index.shape[-2:])
         for column in range(kernel_width):
-            part = pixels.narrow(-1, kernel_width - 1 - column, size[1])
-            frames = frames + weights[..., tap, column, None] * part
+            frames = frames + weights[..., tap, column, None] * pixels.narrow(-1, kernel_width - 1 - column, size[1])
     return frames
 
 

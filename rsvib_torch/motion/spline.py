@@ -194,8 +194,7 @@ class FreeMotion(
         count = self.coefficients.shape[-1]
         low = min(max(math.floor((first - self.start) / self.spacing), 0), count - 4)
         high = min(max(math.ceil((last - self.start) / self.spacing) + 3, low + 4), count)
-        start = self.start + low * self.spacing
-        return replace(self, coefficients=self.coefficients[..., low:high], start=start)
+        return replace(self, coefficients=self.coefficients[..., low:high], start=self.start + low * self.spacing)
 
     def with_axes(self, order: Sequence[int], signs: Sequence[float]) -> Self:
         """The motion whose component k is ``signs[k]`` (1 or -1) times component ``order[k]`` of this motion."""

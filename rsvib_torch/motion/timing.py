@@ -177,8 +177,7 @@ class SensorTiming:
             >>> SensorTiming.from_file("camera.toml").frame_rate  # doctest: +SKIP
             29.97
         """
-        data = read_toml(Path(path))
-        sections = {name: table for name, table in data.items() if name == "sensor"}
+        sections = {name: table for name, table in read_toml(Path(path)).items() if name == "sensor"}
         section: SensorSection = validate(_SensorFile, sections, str(path)).sensor
         return section.to_timing()
 

@@ -304,8 +304,7 @@ class Vibration(
         Tones below 1e-4 px do not count, roll and zoom below 1e-7: 1e-4 px at 1000 px from the centre.
         """
         smallest = self.amplitude.new_tensor([1e-4, 1e-4, 1e-7, 1e-7][: self.amplitude.shape[-2]])
-        visible = self.amplitude > smallest[:, None]
-        return torch.where(visible, self.frequency * duration, 0.0).amax(-1).detach()
+        return torch.where(self.amplitude > smallest[:, None], self.frequency * duration, 0.0).amax(-1).detach()
 
     def with_axes(self, order: Sequence[int], signs: Sequence[float]) -> Self:
         """The vibration whose component k is ``signs[k]`` times component ``order[k]``; amplitudes stay positive."""

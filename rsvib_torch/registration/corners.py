@@ -104,8 +104,7 @@ class CornerFollower:
         (height, width), timing, scale = grey.shape, self._timing, reduction(*grey.shape)
         before, corners_before, votes_before = self._before, self._known, self._votes
         small = cv2.resize(grey, (width // scale, height // scale), interpolation=cv2.INTER_AREA)
-        around = cv2.blur(small, (_AROUND, _AROUND))
-        second = np.asarray(cv2.addWeighted(small, 1.0, around, -1.0, 128.0), np.uint8)
+        second = np.asarray(cv2.addWeighted(small, 1.0, cv2.blur(small, (_AROUND, _AROUND)), -1.0, 128.0), np.uint8)
         starts = np.array([self._start, start])
         self._before, self._start = second, start
         self._known, self._votes = _NO_CORNERS
@@ -177,8 +176,7 @@ def _in_layer(corners: Points, ends: Points, votes: NDArray[np.int64], scale: in
     for limit in _LAYER_LIMITS / scale:
         similarity, inside = cv2.estimateAffinePartial2D(corners[decide], ends[decide], ransacReprojThreshold=limit)
         if similarity is not None and inside.mean() > 0.5:
-            residual = ends - corners @ similarity[:, :2].T - similarity[:, 2]
-            return np.asarray(np.hypot(*residual.T) < 2 * limit)
+            return np.asarray(np.hypot(*(ends - corners @ similarity[:, :2].T - similarity[:, 2]).T) < 2 * limit)
     return np.ones(len(corners), bool)
 
 

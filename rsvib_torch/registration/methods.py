@@ -138,8 +138,7 @@ def subpixel_peak(surface: Tensor) -> tuple[Tensor, Tensor]:
         determinant = by_row2 * by_column2 - np.square(mixed)
         converging = converging & (determinant > 0) & (by_row2 < 0)
         move = np.stack([mixed * by_column - by_column2 * by_row, mixed * by_row - by_row2 * by_column], -1)
-        step = np.clip(move / determinant[:, None], -0.5, 0.5)
-        position = np.where(converging[:, None], position + step, position)
+        position = np.where(converging[:, None], position + np.clip(move / determinant[:, None], -0.5, 0.5), position)
     converging = converging & (np.abs(position) <= 1.0).all(-1)
     position[~converging] = np.nan
     peaks = tensor(np.column_stack([position, value])).to(surface.device)

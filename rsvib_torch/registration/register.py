@@ -280,8 +280,7 @@ def _largest_around(surface: Tensor, reach: int) -> Tensor:
     """Largest values of (..., H, W) within ``reach`` along both axes; by ``max_pool2d``, detection takes 6 % more."""
     for dim, ends in ((-1, [reach] * 2), (-2, [0, 0] + [reach] * 2)):
         padded = functional.pad(surface, ends, value=-torch.inf)
-        shifted = [padded.narrow(dim, lag, surface.shape[dim]) for lag in range(2 * reach + 1)]
-        surface = reduce(torch.maximum, shifted)
+        surface = reduce(torch.maximum, [padded.narrow(dim, lag, surface.shape[dim]) for lag in range(2 * reach + 1)])
     return surface
 
 

@@ -62,8 +62,7 @@ class RowSpectra:
         self.valid = None
         if valid is not None and not bool(valid.all()):
             # pixels that are interpolated from an invalid one are invalid as well
-            invalid = functional.max_pool2d((~valid).to(frames.dtype), 2 * (DEGREE // 2) + 1, 1, DEGREE // 2)
-            self.valid = invalid == 0
+            self.valid = functional.max_pool2d((~valid).to(frames.dtype), 2 * (DEGREE // 2) + 1, 1, DEGREE // 2) == 0
 
     def _index_rows(self) -> None:
         """Set the table of all rows of all frames (shared by parts) and the index of each frame's first row in it."""

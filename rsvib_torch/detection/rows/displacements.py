@@ -313,8 +313,7 @@ def column_pattern_of(groups: list[FrameGroups], timing: RowTiming, motion: Moti
         positions = Positions.of(group.starts_of_groups, height, timing, group_motion, EVERY)
         visible = positions.visible(height, BLOCK_ROWS // EVERY)
         variance = tensor(group_variance).flatten(0, 1).to(visible.device)
-        spectra = group.spectra.in_groups(group.count)
-        parts.append((spectra, positions.rows, positions.shift, visible, variance))
+        parts.append((group.spectra.in_groups(group.count), positions.rows, positions.shift, visible, variance))
     return column_pattern(parts)
 
 

@@ -246,8 +246,7 @@ class GroupedStrips(GroupedFrames):
         """
         place = torch.arange(len(self.groups[0].starts), device=self.columns.device)
         index = place[place % len(self.columns) % 2 == 0]
-        groups = [group.stacks(index) for group in self.groups]
-        every_second = replace(self, groups=groups, columns=self.columns[::2])
+        every_second = replace(self, groups=[group.stacks(index) for group in self.groups], columns=self.columns[::2])
         strip_ratios = GroupedFrames.blur_ratio(every_second, motion)
         ratio, std, size = strip_ratios.unflatten(0, (-1, len(every_second.columns))).unbind(-1)
         weight = torch.where(std > 0, std.square().reciprocal(), 0.0)

@@ -217,8 +217,7 @@ def _detect(stack: GreyFrames, timing: SensorTiming, options: FreeMotionOptions,
         frames, rows, motion = _measured_around(motion, stack, rowwise, spacing, options.iterations, scale)
     measured = rows.measurements
     blur_reasons = exposure_reasons(rowwise, *table(frames.blur_ratio(motion.to(stack.images.device)))[0].tolist())
-    residual = residual_of_motion(measured, motion[0])
-    weighed = measured.weighed(residual)
+    weighed = measured.weighed(residual_of_motion(measured, motion[0]))
     # 2. The last fit, with its uncertainty at the middles of exposures of up to 32 rows of each frame.
     starts = rowwise.frame_starts(stack.images.shape[1])
     rows_of_report = np.linspace(0, scale.height - 1, min(32, scale.height))
@@ -413,8 +412,7 @@ def _with_tones(
     change = table(after - before)
     tone_std = np.hypot(with_allowance.displacement_std[0], change - change.mean((0, 1)))
     # 4. The axes on which they are better.
-    difference = table(_with_tones_on(motion, fit, agree).displacement(times) - motion.displacement(times))
-    size = difference.std((0, 1))
+    size = table(_with_tones_on(motion, fit, agree).displacement(times) - motion.displacement(times)).std((0, 1))
     tone_size, spline_size = (np.sqrt(np.square(values).mean((0, 1))) for values in (tone_std, spread.of_rows))
     replaced = agree & ((tone_size < spline_size) | (2 * tone_size < size))
     replaced &= fit.active[0].sum(-1) <= len(times) - _FRAMES_BESIDE
@@ -527,8 +525,7 @@ def _nearly_blind(motion: FreeMotion, times: Tensor, timing: SensorTiming) -> li
     if timing.frame_start_times is not None:
         return [False] * motion.num_axes
     cycles = vibration_in_place_of(motion, float(times.min()), float(times.max())).frequency[:, 0] * timing.frame_period
-    distance = (cycles - cycles.round()).abs() * len(times)
-    return ((cycles.round() >= 1) & (distance < _NEARLY_BLIND)).tolist()
+    return ((cycles.round() >= 1) & ((cycles - cycles.round()).abs() * len(times) < _NEARLY_BLIND)).tolist()
 
 
 # of the median mean square of residuals within a knot interval; smaller ones are noise. Of steps of 2 and 6 px within
@@ -545,5 +542,4 @@ def _sudden(measured: Measurements, residual: Array, times: Array, spacing: floa
     total = np.concatenate([np.zeros((1, squares.shape[-1])), np.cumsum(squares, 0)])
     begins, ends = (np.searchsorted(sample_times[order], times + side * spacing) for side in (-1.0, 1.0))
     local = (total[ends] - total[begins]) / np.maximum(ends - begins, 1)[..., None]
-    usual = np.median(local, (0, 1))
-    return np.sqrt(np.where(local > _SUDDEN * usual, local, 0.0))
+    return np.sqrt(np.where(local > _SUDDEN * np.median(local, (0, 1)), local, 0.0))

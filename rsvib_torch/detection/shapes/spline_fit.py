@@ -65,8 +65,7 @@ class SplineFit:
     def _variances(self, index: Array, weights: Array) -> Array:
         """Variances (S, F, A) of sums of ``weights`` (S, F, M) times coefficients ``index`` (S, M)."""
         covariances = [covariance[index[:, :, None], index[:, None]] for covariance in self.covariances]
-        variances = [((weights @ covariance) * weights).sum(-1) for covariance in covariances]
-        return np.maximum(np.stack(variances, -1), 0.0)
+        return np.maximum(np.stack([((weights @ covariance) * weights).sum(-1) for covariance in covariances], -1), 0.0)
 
 
 def fit_spline(

@@ -76,8 +76,7 @@ class ToneFit:
         drift = self.drift
         if drift.shape[-1] > 1:  # the constant of (s + moved)^2 / 2 cancels within the group
             drift = np.stack([drift[..., 0] + drift[..., 1] * shift, drift[..., 1]], -1)
-        turned = self.coefficients * unit_wave(turn)
-        return replace(self, coefficients=turned, drift=drift, centre=centre)
+        return replace(self, coefficients=self.coefficients * unit_wave(turn), drift=drift, centre=centre)
 
 
 def tone_response(measurements: Measurements, frequencies: Array) -> Array:

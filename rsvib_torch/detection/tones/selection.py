@@ -250,8 +250,7 @@ class _Search:
 def _disturbed(measurements: Measurements, residual: Array) -> Array:
     """(B,) bool: a stretch of outliers may have biased a fit, which leaves more than 5 % of the motion of some rows."""
     large_residual = quantile(measurements.sizes(residual), 0.9, 1)
-    motion_size = median(measurements.sizes(measurements.displacements), 1)
-    return ~np.all(large_residual < 0.05 * motion_size, -1)
+    return ~np.all(large_residual < 0.05 * median(measurements.sizes(measurements.displacements), 1), -1)
 
 
 # of 1 / duration. 80 recordings of two tones on each axis, 0.2 to 0.9 apart: 73 of 160 axes are reliable, the rms of z
@@ -285,8 +284,7 @@ def _with_blind_tones(measurements: Measurements, weighted: Measurements, fit: T
     weak = fit.active & (size > 0) & (size < weak_limit[:, None])
     is_near = (distance < 1.0) & weak[..., None]
     # 2. For each axis the blind frequency with most side tones, then the nearest.
-    score = is_near.sum(2) + 0.5 / (1 + distance.min(2))
-    best = score.argmax(-1)  # (B, 2)
+    best = (is_near.sum(2) + 0.5 / (1 + distance.min(2))).argmax(-1)  # (B, 2)
     side = np.take_along_axis(is_near, best[:, :, None, None], -1)[..., 0]  # (B, 2, K)
     suspected = np.any(side, -1)
     if not bool(suspected.any()):
