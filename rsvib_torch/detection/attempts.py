@@ -167,7 +167,7 @@ def _moving_parts(refined: FittedRows, timing: RowTiming, stacks: GreyFrames) ->
 
 # -, px; differences between displacements of a half and of the whole. Of 16 recordings with parallax, 5 were accepted
 # with these limits, none wrong. They and those that chose the limits are the same
-_MAX_UNLIKE, _MAX_UNLIKE_PX = 0.01, 0.01
+_MAX_DIFFERENCE, _MAX_DIFFERENCE_PX = 0.01, 0.01
 
 
 def _without_parallax(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, previous: Attempt) -> Attempt:
@@ -189,7 +189,7 @@ def _without_parallax(stacks: GreyFrames, timing: RowTiming, options: DetectionO
         # 2. Each half must be reliable along both axes, with the displacements of the whole.
         stack = stacks.one(index)
         displacement = tone_displacements(previous.fit, row_starts, timing.exposure_time)[index]
-        allowed = np.maximum(_MAX_UNLIKE * displacement.std(0), _MAX_UNLIKE_PX)
+        allowed = np.maximum(_MAX_DIFFERENCE * displacement.std(0), _MAX_DIFFERENCE_PX)
         for columns in (slice(0, half), slice(width - half, width)):
             half_attempt = attempt(stack.columns(columns), timing, options, Hypothesis(FieldScale(2, half, height)))
             difference = tone_displacements(half_attempt.fit, row_starts, timing.exposure_time)[0] - displacement

@@ -16,7 +16,7 @@ from rsvib_torch.detection.tones.fit import ToneFit, model_displacements, residu
 from rsvib_torch.detection.tones.selection import robust_fit
 from rsvib_torch.numerics.tables import Array, split_axis
 
-_KEPT = 4  # steps that are combined; more change results of long exposures by less than their standard deviations
+_NUM_STEPS = 4  # steps that are combined; more change results of long exposures by less than their standard deviations
 _MAX_EXTRAPOLATION = 4.0  # steps
 _SMALL_CHANGE = 0.5  # standard deviations
 
@@ -65,7 +65,7 @@ class Acceleration:
 
     def add(self, step: Step, *, same_tones: bool) -> None:
         """Keep a step; steps with other tones do not predict the next one."""
-        self.steps = [*self.steps[1 - _KEPT :], step] if same_tones else [step]
+        self.steps = [*self.steps[1 - _NUM_STEPS :], step] if same_tones else [step]
 
     def applied(self, measurements: Measurements, fit: ToneFit) -> ToneFit | None:
         """The fit to the corrected measurements of the last step; None before the second step."""

@@ -270,7 +270,7 @@ class Measurements:
 # scene that are compared at a wrong place seem to move by little and have 0.14 px and more; of 19 right axes with
 # offsets of 8 to 40 px, the largest was 0.008 px. Of 60 axes with amplitudes of 18 and 25 px in 256 rows, 3 were wrong
 # by their size and reliable without this and the upper limit of ``permitted``
-_VAGUE, _FAR = 0.1, 8.0
+_LARGE_STD, _LARGE_OFFSET = 0.1, 8.0
 # Residual of one group of frames over that of the typical group, from which on it counts. Of 160 stacks of 4 to 16
 # frames, each with one or two frames lost, one repeated or two swapped (1,920 axes), 21 axes were reliable and wrong;
 # 20 of them had ratios of 15 to 500 or no measured rows in a group. Of 144 right axes of the intact stacks, 4.1 at most
@@ -298,7 +298,7 @@ class OtherMotion:
         visible = measurements.num_differences > 0
         # sqrt(2): from the rms displacement about the mean of the frames to the offset of two of them
         size = math.sqrt(2) * np.sqrt(valid_mean(np.square(measurements.distances(by_tones)), 1))
-        min_weight = np.where((size[..., :2] > _FAR).any(-1, keepdims=True), _VAGUE**-2, 0.0)[..., None]
+        min_weight = np.where((size[..., :2] > _LARGE_OFFSET).any(-1, keepdims=True), _LARGE_STD**-2, 0.0)[..., None]
         measured = visible & (measurements.weights[..., :2] > min_weight).all(-1)
         counts = (split_axis(rows, 1, measurements.groups, -1).sum(2) for rows in (measured, visible))
         num_measured, num_visible = counts

@@ -32,7 +32,7 @@ from rsvib_torch.registration.register import fits_frame
 from rsvib_torch.results.reason import Reason
 
 # timings of a stack, each of which takes a detection: 33 stacks agreed with the first to the third one, none with later
-_MOST_TRIED = 3
+_MAX_TRIED = 3
 
 
 def other_timings(stacks: GreyFrames, timing: SensorTiming, previous: Attempt) -> dict[int, Reason]:
@@ -61,7 +61,7 @@ def _diagnosis(
     # 2. The first of the candidates with which detection is reliable along these axes. Tones that are found with one of
     # them may agree with a better one.
     candidates, num_tried = _candidates(stack, timing, previous, index, any(contradicted), rotates=rotates), 0
-    while candidates and num_tried < _MOST_TRIED:
+    while candidates and num_tried < _MAX_TRIED:
         candidate, num_tried = candidates.pop(0), num_tried + 1
         reordered, row_timing = stack.with_timing(candidate), candidate.in_row_order()
         scale = FieldScale(2, reordered.images.shape[-1], reordered.images.shape[-2])

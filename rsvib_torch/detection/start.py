@@ -1,7 +1,7 @@
-"""The start of every detection: the offsets of row bands of grey frames, and the measurements these give.
+"""The start of every detection: the offsets of row bands of grey frames, as measurements for a fit.
 
 Roll and zoom displace the content of a row by amounts that depend on the column (``displacement_at``). For a start,
-strips of columns are registered like stacks of their own. With the displacement ``d_s`` of a row in strip s, its
+strips of columns are registered as separate stacks. With the displacement ``d_s`` of a row in strip s, its
 information ``W_s`` and the factors ``F_s`` from the components q of the motion to the displacement at the strip, the
 components of the row are the weighted least-squares solution
 
@@ -66,12 +66,12 @@ class FieldScale:
         return replace(fitted.scaled(self.units(fitted.amplitude)), camera=self.camera)
 
     def free_motion(self, fitted: FreeMotion) -> FreeMotion:
-        """The same for a free motion."""
+        """``motion`` for a free motion."""
         coefficients = fitted.coefficients * self.units(fitted.coefficients)[:, None]
         return FreeMotion(coefficients, fitted.start, fitted.spacing, self.motion(fitted.tones))
 
     def std(self, fitted: VibrationStd) -> VibrationStd:
-        """The same for standard deviations."""
+        """``motion`` for standard deviations."""
         factor = self.units(fitted.amplitude)
         values = {name: getattr(fitted, name) for name in ("image_motion", "image_acceleration", "displacement")}
         scaled = {name: value * factor for name, value in values.items() if value is not None}
@@ -143,8 +143,8 @@ def band_curve(
 ) -> OffsetCurve:
     """Offsets of the row bands of grey frames (B, T, H, W), NaN for bands with more than half of their pixels missing.
 
-    A ``mere_start`` is only the start of a fit to rows. Of wide frames, the 320 columns with the most detail are used
-    then, unless a fifth of their bands cannot be registered.
+    A ``mere_start`` is only the start of a fit to rows: only the 320 columns of wide frames with the most detail are
+    used, unless a fifth of their bands cannot be registered.
     """
     check_frame_size(frames.shape[-2], frames.shape[-1], options)  # of the user's frames, not of the columns in use
     curve = None
@@ -170,8 +170,8 @@ class BandStart:
     """Offsets of row bands, with which every detection starts."""
 
     curve: OffsetCurve  # (B, P, N) offsets; with roll and zoom in px (``FieldScale``)
-    measurements: Measurements  # the same as input of a fit
-    fit: ToneFit | None = None  # tones that are known; None if there are none
+    measurements: Measurements  # the offsets as input of a fit
+    fit: ToneFit | None = None  # fit of tones that are known; None if there are none
 
     def predicted(self, fit: ToneFit) -> Array:
         """Offsets (B, P, N, A) in px of the row bands that a fit predicts."""

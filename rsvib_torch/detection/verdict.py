@@ -284,14 +284,14 @@ def contradicted_axes(findings: Findings) -> list[bool]:
 # Roll and zoom
 
 
-def _max_apart(size: Array | float) -> Array:
+def _max_difference(size: Array | float) -> Array:
     """Largest permitted difference in px of the displacements along a row, for an axis with offsets of size px rms."""
     return np.maximum(0.009 * size, 0.035)
 
 
 def halves_move_apart(other_motion: OtherMotion) -> Array:
     """(B,) whether the halves of the rows move apart, as roll and zoom cause it."""
-    return np.any(other_motion.differential[..., ::-1] > _max_apart(other_motion.size), -1)
+    return np.any(other_motion.differential[..., ::-1] > _max_difference(other_motion.size), -1)
 
 
 # Limits of roll and zoom as the cause. Clouds, parallax and objects had 0.12 px and more of the differences along a row
@@ -315,7 +315,7 @@ def rotation_possible(other_motion: OtherMotion, uneven: Array, aspect: float) -
     is the rows of a frame over its columns.
     """
     difference = other_motion.differential[..., ::-1]
-    max_uneven = np.maximum(_MAX_UNEVEN * _max_apart(other_motion.size), _MAX_UNEVEN_PART * difference)
+    max_uneven = np.maximum(_MAX_UNEVEN * _max_difference(other_motion.size), _MAX_UNEVEN_PART * difference)
     is_uneven = (uneven[..., ::-1] > max_uneven).any(-1)
     limit = np.maximum(other_motion.permitted, _MAX_MOVED * max(1.0, aspect) * difference.max(-1, keepdims=True))
     return halves_move_apart(other_motion) & ~is_uneven & ~(other_motion.unexplained > limit).any(-1)
@@ -331,7 +331,7 @@ def rotation_reasons(axis: int, axes: int, differential: Sequence[float], size: 
     ``differential`` (2,) px is the rms difference of the displacements along a row that the motion does not explain,
     and ``size`` px the rms offset along the axis.
     """
-    allowed = float(_max_apart(size))
+    allowed = float(_max_difference(size))
     if axes > 2:
         difference = max(differential)
     elif differential[axis] > _MAX_TWO_MOTIONS * allowed:

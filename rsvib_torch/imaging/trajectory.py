@@ -75,8 +75,8 @@ def rows_showing(
 
     They are the solution of ``r = s + Y(t(r))``.
     Row r is exposed from ``frame_start + r T_row`` on, and Y is the mean displacement over that exposure (Eq. 2).
-    Newton's method with shorter steps where a step increases the error; ``|dY/dt| T_row`` is 0.02 for 5 px at 30 Hz,
-    and must stay below 1: content that moves along the scan as fast as the rows is never passed. The vibration is in
+    Newton's method solves it, with shorter steps where one increases the error; ``|dY/dt| T_row`` is 0.02 for 5 px at
+    30 Hz, and must stay below 1: rows do not pass content that moves along the scan as fast. The vibration is in
     row order, its batch dimensions lead; ``frame_start`` in s broadcasts to S, and other exposures in s than that of
     the sensor to (S, 1).
     """
@@ -96,7 +96,7 @@ def rows_showing(
         slope = (above - below) / 2e-3
         error = scene_rows + displacement[..., 1] - rows
         newton = error / (1.0 - slope[..., 1].detach()).clamp(min=0.1)
-        # 2. Each step is the square of the last one times the same number: end if the next one would be below 1e-6 px.
+        # 2. Each step is the square of the last one times a constant: end if the next one would be below 1e-6 px.
         size, change = error.detach().abs(), newton.detach()
         before, largest = largest, float(change.abs().max())
         if largest**3 <= 1e-6 * (before**2 + 1e-12):
@@ -161,13 +161,13 @@ def recorded_offsets(
 
 
 def places_at_rest(motion: Motion, recorded: Array, starts: Array, exposure_time: float) -> Array:
-    """Places s (N, 2) in px from the centre of content that was recorded at ``q = s + D(s, t)``, the inverse of above.
+    """Places s (N, 2) in px from the centre of content that was recorded at ``q = s + D(s, t)``.
 
     The places q (N, 2) were recorded in exposures from ``starts`` (N,) in s on.
     """
     components = motion.mean_displacement(torch.from_numpy(starts), exposure_time)
     still = q = torch.from_numpy(recorded)
-    for _ in range(3):  # each makes the error smaller by the roll and zoom: 1e-4 px with 0.05 rad and 20 px
+    for _ in range(3):  # each multiplies the error by about the roll and zoom: 1e-4 px with 0.05 rad and 20 px
         still = q - displacement_at(components, still[:, 0], still[:, 1], motion.camera)
     return still.numpy()
 

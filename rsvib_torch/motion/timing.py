@@ -353,7 +353,7 @@ class RowTiming(SensorTiming):
 
 
 def with_lost_frame(timing: SensorTiming, num_frames: int, first: int) -> SensorTiming:
-    """The timing of ``num_frames`` frames of which the one before the frame ``first`` was lost."""
+    """The timing of ``num_frames`` frames if a further frame was lost before the frame ``first``."""
     starts: list[float] = timing.frame_starts(num_frames).tolist()
     later = [start + timing.frame_period * (frame >= first) for frame, start in enumerate(starts)]
     return replace(timing, frame_start_times=tuple(later))
@@ -378,10 +378,10 @@ def row_axes(timing: SensorTiming, num_axes: int) -> tuple[list[int], list[float
 
 
 def other_intervals(timing: SensorTiming | RowTiming, starts: Tensor, num_rows: int) -> tuple[float, float] | None:
-    """Shortest and longest interval in s between frames that are not 1 to 3 frame periods apart, to 1 %.
+    """Shortest and longest interval in s between frames whose intervals are not whole frame periods, to 1 %.
 
-    Otherwise None, also for more missing frames between others, and for line sensors: frames of the latter have no
-    blanking rows, and start after delays.
+    None if they are and the shortest one is at most 3 periods, and for line sensors: their frames have no blanking
+    rows, and start after delays.
     """
     if len(starts) < 2 or timing.frame_rows <= num_rows:
         return None

@@ -39,22 +39,22 @@ _SHARE_OF_ALIASING = 1 / 8
 # a camera that aliases, without and with this: two frames 13.3, 12.3; four 21.7, 16.8; eight 12.3, 11.6; roll 10.4,
 # 9.1. Medians decrease by 8 to 19 %. Scenes behind soft optics are not affected
 _LEAST_ALIASED = 1e-3
-# of the mean of all rows. Rows of bars or of a clipped sky have no noise, and what the Wiener filter spreads from their
-# neighbours as detail: without this, 40 black rows of 360 changed amplitudes by 1 %, 13 standard deviations
+# of the mean of all rows. Rows of bars or of a clipped sky have no noise, only detail that the Wiener filter spreads
+# from their neighbours: without this, 40 black rows of 360 changed amplitudes by 1 %, 13 standard deviations
 _LEAST_VARIANCE = 0.01
 _NOISE_STEP = 4  # along the rows, every fourth frequency gives the noise power
 
 
 @dataclass(frozen=True, eq=False)
 class RowGradients:
-    """Gradients of the scene for the rows of a group of G frames, and their products with the frames' differences."""
+    """Gradients of the scene for the rows of a group of G frames, and their products with differences of the frames."""
 
     # (B, S, A + 1, L) weight times the derivatives of the scene by the A components of the motion, x and y first, and
     # the detail of the scene, less their means
     images: Tensor
     products: Tensor  # (B, S, A + 1, A + 1) float64 sums of their products
-    # (B, S, A + 1, G) float64 sums of their products with the differences of the frames; of two frames (B, S, A + 1,
-    # 1), of the first
+    # (B, S, A + 1, G) float64 sums of their products with the differences of the frames; for two frames (B, S, A + 1,
+    # 1), those of the first
     residual_products: Tensor
     variance: Tensor  # (B, S) float64, noise variance of a pixel in a frame
     # (B, S, 4, 5) float64, sums gx gx, gx gy, gy gy, gx e and gy e over the quarters of each row from left to right,

@@ -363,7 +363,7 @@ class _Spread:
 # rms difference of the displacements of rows by tones from those by a spline, over their standard deviation. Of 240
 # axes of random walks and smooth motions in five frames, tones were at least 2.0 apart, of 160 axes with the right
 # tones at most 1.1
-_MAX_APART = 1.3
+_MAX_DIFFERENCE = 1.3
 # frames beyond the number of tones of an axis that may take the place of a spline: three tones agreed with a random
 # walk in two frames and were wrong by 21 px, with a standard deviation of 0.1 px
 _FRAMES_BESIDE = 2
@@ -401,7 +401,7 @@ def _with_tones(
     fit = fitted_again(weighed, fit)
     # 2. The axes on which they agree with the spline.
     deviation = (residual_of(measured, fit) - residual)[0][measured.visible[0] > 0]
-    agree = fit.active[0].any(-1) & (np.sqrt(np.square(deviation).mean(0)) < _MAX_APART * noise_std)
+    agree = fit.active[0].any(-1) & (np.sqrt(np.square(deviation).mean(0)) < _MAX_DIFFERENCE * noise_std)
     if not agree.any():
         return motion, spread
     # 3. Their standard deviation, with the allowance for a further one and for the row time.

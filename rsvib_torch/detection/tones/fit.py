@@ -348,13 +348,13 @@ def fit_tones(
 
 
 def fitted_again(measurements: Measurements, fit: ToneFit) -> ToneFit:
-    """``fit_tones`` from an earlier fit, and that fit itself for stacks where it diverges."""
+    """``fit_tones`` from an earlier fit; the earlier fit for stacks where it diverges."""
     exact = fit_tones(measurements, fit, fit.active)
     return select_stacks(is_bounded(exact, measurements.exposure_time), exact, fit)
 
 
-# px, motion during an exposure; px and px/s, amplitude and drift; Hz. Fits beyond diverge: frames are smaller. A path
-# of 700 px in each of four frames of 400 px took 120 s
+# px, motion during an exposure; px, amplitude; Hz. Fits with larger values have diverged: frames are smaller. A path of
+# 700 px in each of four frames of 400 px took 120 s
 _MAX_PATH, _MAX_SIZE, _MAX_FREQUENCY = 300.0, 1e6, 1e9
 
 
@@ -398,10 +398,10 @@ def motion_of_fit(fit: ToneFit, device: torch.device | None = None) -> Vibration
 def vibration_of_fit(fit: ToneFit) -> tuple[Vibration, VibrationStd]:
     """``motion_of_fit`` and its standard deviations; 0 for tones that are not active.
 
-    They are of first order, but for uncertain frequencies. Rows determine the square of the frequency f of a slow tone,
-    and the inverse of an amplitude that depends on f, with symmetric errors; the image motion compensates a slow tone
-    in proportion to its period. The stated deviation of these is half of the distance to the limit that two standard
-    deviations give, at most 4.5 times the value.
+    They are of first order, except for uncertain frequencies. Rows determine the square of the frequency f of a slow
+    tone, and the inverse of an amplitude that depends on f, with symmetric errors; the image motion compensates a slow
+    tone in proportion to its period. The standard deviation of these is half of the distance to the limit at two
+    standard deviations, at most 4.5 times the value.
     """
     # 1. First order.
     centre = fit.centre[:, None, None]
@@ -444,10 +444,8 @@ def vibration_of_fit(fit: ToneFit) -> tuple[Vibration, VibrationStd]:
 def displacement_std(fit: ToneFit, exposure_starts: Array, exposure_time: float) -> Array:
     """Standard deviation (B, 2) in px of the displacement of rows (N,) without their mean, rms over the rows."""
     jacobian = displacement_jacobian(fit, exposure_starts[None], exposure_time)
-    jacobian = jacobian - jacobian.mean(1, keepdims=True)
-    covariance = _covariance_of_axes(fit)
-    jacobian = jacobian.swapaxes(1, 2)  # (B, A, N, P)
-    return np.sqrt(np.maximum(((jacobian @ covariance) * jacobian).sum(-1), 0.0).mean(-1))
+    jacobian = (jacobian - jacobian.mean(1, keepdims=True)).swapaxes(1, 2)  # (B, A, N, P)
+    return np.sqrt(np.maximum(((jacobian @ _covariance_of_axes(fit)) * jacobian).sum(-1), 0.0).mean(-1))
 
 
 def displacement_jacobian(fit: ToneFit, exposure_starts: Array, exposure_time: float) -> Array:
@@ -483,8 +481,7 @@ def shrunk(fit: ToneFit, intervals: Array) -> ToneFit:
     """The fit with uncertain amplitudes near blind frequencies reduced, for warping frames by its motion.
 
     An amplitude A of standard deviation s becomes ``A max(0, 1 - s^2 / A^2)`` (positive-part James-Stein estimate)
-    where the gain is small. Tones that hardly move the frames against each other, but through ``LARGEST`` of their
-    size, are left out.
+    where the gain is small. Nearly blind tones whose amplitude exceeds about ``LARGEST`` are left out.
     """
     blindness = 1 / (1 + np.square(offset_gain(fit.frequencies, intervals) / MIN_GAIN))
     noise = np.square(amplitude_std(fit) / np.maximum(np.abs(fit.coefficients), 1e-30))
@@ -503,7 +500,7 @@ def strongest_only(fit: ToneFit) -> ToneFit:
 
 
 def with_tones(fit: ToneFit, count: int) -> ToneFit:
-    """The fit with room for ``count`` tones on each axis; the further ones do not exist."""
+    """The fit with arrays for ``count`` tones on each axis; the added ones are not active."""
     further = ((0, 0), (0, 0), (0, count - fit.active.shape[-1]))
     names = ("coefficients", "frequencies", "active")
     extended: Table = {name: np.pad(getattr(fit, name), further) for name in names}
@@ -511,7 +508,7 @@ def with_tones(fit: ToneFit, count: int) -> ToneFit:
 
 
 def covariance_with_tones(covariance: Array, fit: ToneFit, count: int) -> Array:
-    """A covariance (B, A P, A P) of the parameters of a fit as that of ``count`` tones on each axis; 0 for others."""
+    """A covariance (B, A P, A P) of the parameters of a fit, enlarged to ``count`` tones on each axis by zeros."""
     axes, tones = fit.active.shape[1:]
     added = np.full(axes, 3 * (count - tones))
     places = np.repeat((np.arange(axes) + 1) * (covariance.shape[-1] // axes) - fit.drift.shape[-1], added)
@@ -519,7 +516,7 @@ def covariance_with_tones(covariance: Array, fit: ToneFit, count: int) -> Array:
 
 
 def with_axes(fit: ToneFit, axes: int) -> ToneFit:
-    """The strongest tones of a fit as one with further axes, which have no tones; without a covariance."""
+    """The strongest tone of each axis of a fit, with further axes that have no tones; without a covariance."""
     fit = strongest_only(fit)
     further = ((0, 0), (0, axes - fit.active.shape[1]), (0, 0))
     names = ("coefficients", "frequencies", "active", "drift")
