@@ -1,6 +1,6 @@
 """The hypotheses that detection tries, one after the other.
 
-1. The motion is a translation: all columns of a row are displaced alike.
+1. The motion is a translation: all columns of a row have the same displacement.
 2. If the halves of the rows move apart as roll and zoom cause it, or if roll and zoom are requested: a motion with
    roll and zoom. All stacks of a batch have these components then, if any stack rolls.
 3. If the halves of the rows move apart in another way: a translation without the parts of the frames that move by
@@ -10,8 +10,8 @@
 5. If the rows agree with another timing: that timing (``other_timing``), which then is the reason against the axes. The
    vibration is that of the stated timing.
 
-The findings of an attempt (``pipeline``) decide whether the next hypothesis is tried, and whether it was abandoned,
-whether it is accepted.
+The findings of an attempt (``pipeline``) decide whether the next hypothesis is tried. It is accepted unless its attempt
+is abandoned.
 
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
@@ -82,7 +82,7 @@ def detect_tones(
     reliable, findings = result.reliable.clone(), list(result.findings)
     for index, reason in other_timings(stacks, timing, translation).items():
         reliable[index] = False
-        findings[index] = tuple((reason, *of_axis) for of_axis in findings[index])
+        findings[index] = tuple((reason, *reasons) for reasons in findings[index])
     return replace(result, reliable=reliable, findings=tuple(findings))
 
 
@@ -110,36 +110,36 @@ _MOVES_BY_ITSELF, _MOST_MOVING = 0.1, 0.7
 
 
 def _without_moving_parts(
-    stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, result: Attempt, where: Array
+    stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, previous: Attempt, tried: Array
 ) -> tuple[GreyFrames, Attempt]:
     """Stacks without the parts of the frames that move by themselves, and their attempt, if it refuses fewer axes.
 
-    Rows that clouds or objects cover in part have a displacement between both motions. It is tried for the stacks
-    ``where`` (B,) is true and the halves of the rows move apart.
+    Rows that clouds or objects cover in part have a displacement between both motions. This is tried for the stacks
+    where ``tried`` (B,) is true and the halves of the rows move apart.
     """
-    refined = result.fitted.refined
+    refined = previous.fitted.refined
     if refined is None:
-        return stacks, result
-    where = where & halves_move_apart(refined.other_motion)
-    if not where.any():
-        return stacks, result
+        return stacks, previous
+    tried = tried & halves_move_apart(refined.other_motion)
+    if not tried.any():
+        return stacks, previous
     # 1. The stacks in which some parts, but not most of them, move by themselves, without these.
     moving = _moving_parts(refined, timing, stacks)
     share = moving.mean((1, 2, 3))
-    where = where & (share > 0) & (share < _MOST_MOVING)
-    if not where.any():
-        return stacks, result
-    part = stacks.some(where).only(~moving[where])
-    other = attempt(part, timing, options, Hypothesis(result.scale, is_doubtful=True))
+    tried = tried & (share > 0) & (share < _MOST_MOVING)
+    if not tried.any():
+        return stacks, previous
+    reduced = stacks.some(tried).only(~moving[tried])
+    without_parts = attempt(reduced, timing, options, Hypothesis(previous.scale, is_doubtful=True))
     # 2. All stacks, without these parts where that refuses fewer axes.
-    for index, against in zip(np.flatnonzero(where).tolist(), other.findings, strict=True):
-        where[index] = sum(map(bool, against)) < sum(map(bool, result.findings[index]))
-    if not where.any():
-        return stacks, result
-    if not where.all():
-        part = stacks.only(~(moving & where[:, None, None, None]))
-        other = attempt(part, timing, options, Hypothesis(result.scale))
-    return part, other
+    for index, against in zip(np.flatnonzero(tried).tolist(), without_parts.findings, strict=True):
+        tried[index] = sum(map(bool, against)) < sum(map(bool, previous.findings[index]))
+    if not tried.any():
+        return stacks, previous
+    if not tried.all():
+        reduced = stacks.only(~(moving & tried[:, None, None, None]))
+        without_parts = attempt(reduced, timing, options, Hypothesis(previous.scale))
+    return reduced, without_parts
 
 
 def _moving_parts(refined: FittedRows, timing: RowTiming, stacks: GreyFrames) -> Array:
@@ -149,27 +149,28 @@ def _moving_parts(refined: FittedRows, timing: RowTiming, stacks: GreyFrames) ->
     """
     count, num_frames, height, width = stacks.images.shape
     motion = motion_of_fit(shrunk(refined.fit, compared_intervals(timing, num_frames)), stacks.images.device)
-    first, in_frames = 0, []
+    first_frame, moving_in_frames = 0, []
     for group, gradients in zip(refined.frames.groups, refined.frames.measure(motion).gradients, strict=True):
-        shift, _, regular = map(table, displacements_of_parts(gradients))
-        far = np.abs(shift - np.median(shift, 2, keepdims=True)).max(-1) > _MOVES_BY_ITSELF  # (B M, N, 4)
-        for of_group in np.moveaxis(split_axis(far & regular[..., None], 0, count, -1), 1, 0):
-            in_frames.append((slice(first, first + group.size), of_group))
-            first += group.size - 1
-    blocks, parts = in_frames[0][1].shape[1:]
+        displacement, _, regular = map(table, displacements_of_parts(gradients))
+        deviation = np.abs(displacement - np.median(displacement, 2, keepdims=True)).max(-1)  # (B M, N, 4) px
+        is_moving = split_axis((deviation > _MOVES_BY_ITSELF) & regular[..., None], 0, count, -1)
+        for moving_in_group in np.moveaxis(is_moving, 1, 0):
+            moving_in_frames.append((slice(first_frame, first_frame + group.size), moving_in_group))
+            first_frame += group.size - 1
+    blocks, parts = moving_in_frames[0][1].shape[1:]
     moving = np.zeros((count, num_frames, blocks, parts), dtype=bool)
-    for frames, of_group in in_frames:
-        moving[:, frames] |= of_group[:, None]
+    for frames, moving_in_group in moving_in_frames:
+        moving[:, frames] |= moving_in_group[:, None]
     rows = np.minimum(np.arange(height) // SUMMED_ROWS, blocks - 1)
     return moving[:, :, rows][..., np.arange(width) * parts // width]
 
 
 # -, px; differences between displacements of a half and of the whole. Of 16 recordings with parallax, 5 were accepted
 # with these limits, none wrong. They and those that chose the limits are the same
-_MAX_UNLIKE, _MAX_UNLIKE_PX = 0.01, 0.01
+_MAX_DIFFERENCE, _MAX_DIFFERENCE_PX = 0.01, 0.01
 
 
-def _without_parallax(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, result: Attempt) -> Attempt:
+def _without_parallax(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, previous: Attempt) -> Attempt:
     """The attempt without the reason that the halves of the rows move apart, for stacks whose halves vibrate alike.
 
     Roll moves the halves of a row apart along y and zoom along x, so that their tones differ. A uniform roll or zoom
@@ -177,32 +178,32 @@ def _without_parallax(stacks: GreyFrames, timing: RowTiming, options: DetectionO
     """
     num_frames, height, width = stacks.images.shape[1:]
     half = width // 2
-    if result.fitted.refined is None or num_frames < 3 or not fits_frame(height, half, options.bands):
-        return result
+    if previous.fitted.refined is None or num_frames < 3 or not fits_frame(height, half, options.bands):
+        return previous
     row_starts = table(timing.row_starts(num_frames, height)[:, ::8].flatten())
-    findings = list(result.findings)
-    for index, against in enumerate(result.findings):
+    findings = list(previous.findings)
+    for index, against in enumerate(previous.findings):
         # 1. Stacks that are refused along an axis for this reason only.
-        if not any({reason.code for reason in of_axis} == {"halves_apart"} for of_axis in against):
+        if not any({reason.code for reason in reasons} == {"halves_apart"} for reasons in against):
             continue
         # 2. Each half must be reliable along both axes, with the displacements of the whole.
         stack = stacks.one(index)
-        whole = tone_displacements(result.fit, row_starts, timing.exposure_time)[index]
-        allowed = np.maximum(_MAX_UNLIKE * whole.std(0), _MAX_UNLIKE_PX)
-        for part in (slice(0, half), slice(width - half, width)):
-            of_half = attempt(stack.columns(part), timing, options, Hypothesis(FieldScale(2, half, height)))
-            difference = tone_displacements(of_half.fit, row_starts, timing.exposure_time)[0] - whole
-            if any(of_half.findings[0]) or (difference.std(0) > allowed).any():
+        displacement = tone_displacements(previous.fit, row_starts, timing.exposure_time)[index]
+        allowed = np.maximum(_MAX_DIFFERENCE * displacement.std(0), _MAX_DIFFERENCE_PX)
+        for columns in (slice(0, half), slice(width - half, width)):
+            half_attempt = attempt(stack.columns(columns), timing, options, Hypothesis(FieldScale(2, half, height)))
+            difference = tone_displacements(half_attempt.fit, row_starts, timing.exposure_time)[0] - displacement
+            if any(half_attempt.findings[0]) or (difference.std(0) > allowed).any():
                 break
         else:
             findings[index] = tuple(
-                tuple(reason for reason in of_axis if reason.code != "halves_apart") for of_axis in against
+                tuple(reason for reason in reasons if reason.code != "halves_apart") for reasons in against
             )
-    return replace(result, findings=tuple(findings))
+    return replace(previous, findings=tuple(findings))
 
 
-def _moving_axes(result: Attempt, least: int) -> int:
+def _moving_axes(rotation: Attempt, least_axes: int) -> int:
     """Number of components up to the last one with a significant tone in any stack, at least ``least``."""
-    significant = result.vibration.amplitude > MIN_SIGNIFICANCE * result.std_if_hidden_tone.amplitude
+    significant = rotation.vibration.amplitude > MIN_SIGNIFICANCE * rotation.std_if_hidden_tone.amplitude
     moving = significant.any(0).any(-1).tolist()
-    return max([least, *(axis + 1 for axis in range(2, len(moving)) if moving[axis])])
+    return max([least_axes, *(axis + 1 for axis in range(2, len(moving)) if moving[axis])])

@@ -16,7 +16,7 @@ from rsvib_torch.detection.tones.fit import ToneFit, model_displacements, residu
 from rsvib_torch.detection.tones.selection import robust_fit
 from rsvib_torch.numerics.tables import Array, split_axis
 
-_KEPT = 4  # steps that are combined; more change results of long exposures by less than their standard deviations
+_NUM_STEPS = 4  # steps that are combined; more change results of long exposures by less than their standard deviations
 _MAX_EXTRAPOLATION = 4.0  # steps
 _SMALL_CHANGE = 0.5  # standard deviations
 
@@ -43,9 +43,9 @@ def is_converged(previous: ToneFit, fit: ToneFit) -> Array:
     """
     if previous.active.shape != fit.active.shape:
         return np.zeros_like(fit.active[..., 0])
-    deviation = fit.covariance.diagonal(axis1=-2, axis2=-1)
-    deviation = np.sqrt(np.maximum(split_axis(deviation, -1, fit.coefficients.shape[1], -1), 0.0))
-    std = split_axis(deviation[..., : 3 * fit.frequencies.shape[-1]], -1, -1, 3)  # of Re C, Im C and f
+    variance = split_axis(fit.covariance.diagonal(axis1=-2, axis2=-1), -1, fit.coefficients.shape[1], -1)
+    std = np.sqrt(np.maximum(variance[..., : 3 * fit.frequencies.shape[-1]], 0.0))
+    std = split_axis(std, -1, -1, 3)  # of Re C, Im C and f
     change = np.abs(previous.about(fit.centre).coefficients - fit.coefficients)
     same_frequency = np.abs(previous.frequencies - fit.frequencies) <= _SMALL_CHANGE * std[..., 2]
     small = (change <= _SMALL_CHANGE * std[..., :2].max(-1)) & same_frequency
@@ -65,7 +65,7 @@ class Acceleration:
 
     def add(self, step: Step, *, same_tones: bool) -> None:
         """Keep a step; steps with other tones do not predict the next one."""
-        self.steps = [*self.steps[1 - _KEPT :], step] if same_tones else [step]
+        self.steps = [*self.steps[1 - _NUM_STEPS :], step] if same_tones else [step]
 
     def applied(self, measurements: Measurements, fit: ToneFit) -> ToneFit | None:
         """The fit to the corrected measurements of the last step; None before the second step."""
@@ -80,10 +80,9 @@ class Acceleration:
         pairs = list(itertools.pairwise(self.steps))
         fitted = np.stack([after.fitted - before.fitted for before, after in pairs], -1)
         # the combination of differences of changes that is nearest to the last change, (B, n, M) for M differences
-        changes = [(after.change - before.change).reshape(len(fitted), -1) for before, after in pairs]
-        change = np.stack(changes, -1)
-        gram, right = change.mT @ change, change.mT @ self.steps[-1].change.reshape(len(fitted), -1, 1)
-        ridge = 1e-3 * np.maximum(gram.diagonal(axis1=-2, axis2=-1).mean(-1), 1e-30)
-        share = np.linalg.solve(gram + ridge[:, None, None] * np.eye(len(pairs)), right)[..., 0]
+        change = np.stack([(after.change - before.change).reshape(len(fitted), -1) for before, after in pairs], -1)
+        normal, right_side = change.mT @ change, change.mT @ self.steps[-1].change.reshape(len(fitted), -1, 1)
+        ridge = 1e-3 * np.maximum(normal.diagonal(axis1=-2, axis2=-1).mean(-1), 1e-30)
+        share = np.linalg.solve(normal + ridge[:, None, None] * np.eye(len(pairs)), right_side)[..., 0]
         share = np.clip(share, -_MAX_EXTRAPOLATION, _MAX_EXTRAPOLATION)
         return (fitted * share[:, None, None, None]).sum(-1)

@@ -77,8 +77,8 @@ def detect_vibration(frames: FramesOrFiles, timing: SensorTiming, options: Vibra
     if options.roll is False and zoom:
         raise ValueError("zoom=True measures roll as well, and roll=False excludes it; pass roll=True, or zoom=False")
     axes = 4 if zoom is True else 3 if options.roll is True else 2, 4 if zoom else 3 if options.roll else 2
-    tones, drift_order = None if options.tones == "auto" else options.tones, 2 if options.image_acceleration else 1
-    chosen = DetectionOptions(options.method, tones, drift_order, options)
+    tones = None if options.tones == "auto" else options.tones
+    detection_options = DetectionOptions(options.method, tones, 2 if options.image_acceleration else 1, options)
     if options.columns is not None:
         if camera is not None or options.roll is True or options.zoom is True:
             raise ValueError(
@@ -89,7 +89,7 @@ def detect_vibration(frames: FramesOrFiles, timing: SensorTiming, options: Vibra
 
     # 2. One result from all frames.
     with threads_for(stacks.images):
-        result = detect_tones(stacks, timing, chosen, axes, camera)
+        result = detect_tones(stacks, timing, detection_options, axes, camera)
     return result if stacks.batched else result[0]
 
 

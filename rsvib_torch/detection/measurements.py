@@ -28,7 +28,7 @@ class Measurements:
     """
 
     exposure_starts: Array  # (B, N, G) float64 s, exposure start of the row of each frame that contains scene row n
-    # (B, N, G, 2) float64 px, axes (x, y), with zero mean over the frames that contain the row; 0 in the others
+    # (B, N, G, 2) float64 px, axes (x, y), with zero mean over the frames that contain the row; 0 in other frames
     displacements: Array
     visible: Array  # (B, N, G) float64, 1 where a frame contains the row, else 0
     # (B, N, 2, 2) float64 px^-2, inverse covariance of the displacement in one frame up to a common factor; 0 where
@@ -68,8 +68,7 @@ class Measurements:
         """(2, 1, A, 1) seconds over which displacements are averages: the exposure, the rows of a band."""
         axes = self.displacements.shape[-1]
         along, across = self.average_times
-        times = [[self.exposure_time] * axes, [along, across, along, along][:axes]]
-        return np.array(times)[:, None, :, None]
+        return np.array([[self.exposure_time] * axes, [along, across, along, along][:axes]])[:, None, :, None]
 
     @cached_property
     def drifts(self) -> Array:
@@ -103,7 +102,7 @@ class Measurements:
         """(B, N, 2) inverse variance ``1 / (W^-1)_aa`` of the displacement of each axis, W the information."""
         axes = self.information.shape[-1]
         # the last pivot of a Cholesky factor belongs to an axis that is conditioned on none
-        orders = [[*(other for other in range(axes) if other != axis), axis] for axis in range(axes)]
+        orders = [[*(other_axis for other_axis in range(axes) if other_axis != axis), axis] for axis in range(axes)]
         reordered = np.stack([self.information[..., order, :][..., order] for order in orders], 2)
         return np.square(cholesky_root(reordered)[..., -1, -1])
 
@@ -205,9 +204,9 @@ class Measurements:
         0 unless it is more than ``_WORST`` times that of the typical group. Clouds may cover half of the rows. All
         axes have it: the displacement along one determines which rows are compared along the others.
         """
-        of_groups = median(split_axis(self.distances(residual), 1, self.groups, -1), 2)
-        worst = without_nan(of_groups, 0.0).max(1)
-        return np.where(worst > _WORST * median(of_groups, 1), worst, 0.0).max(-1, keepdims=True)
+        distances = median(split_axis(self.distances(residual), 1, self.groups, -1), 2)
+        worst = without_nan(distances, 0.0).max(1)
+        return np.where(worst > _WORST * median(distances, 1), worst, 0.0).max(-1, keepdims=True)
 
     def independent_fraction(self, residual: Array) -> Array:
         """(B,) fraction of the rows that are independent, from the correlation rho(k) of residuals k rows apart.
@@ -223,7 +222,7 @@ class Measurements:
     # Robust weights
 
     def _sizes_for_weights(self, residual: Array) -> Array:
-        """``sizes``; with roll and zoom one of all axes of a row: unequal weights would mix correlated components."""
+        """``sizes``; with roll and zoom, one size for all axes: unequal weights would mix correlated components."""
         axes = self.information.shape[-1]
         if axes == 2:
             return self.sizes(residual)
@@ -271,7 +270,7 @@ class Measurements:
 # scene that are compared at a wrong place seem to move by little and have 0.14 px and more; of 19 right axes with
 # offsets of 8 to 40 px, the largest was 0.008 px. Of 60 axes with amplitudes of 18 and 25 px in 256 rows, 3 were wrong
 # by their size and reliable without this and the upper limit of ``permitted``
-_VAGUE, _FAR = 0.1, 8.0
+_LARGE_STD, _LARGE_OFFSET = 0.1, 8.0
 # Residual of one group of frames over that of the typical group, from which on it counts. Of 160 stacks of 4 to 16
 # frames, each with one or two frames lost, one repeated or two swapped (1,920 axes), 21 axes were reliable and wrong;
 # 20 of them had ratios of 15 to 500 or no measured rows in a group. Of 144 right axes of the intact stacks, 4.1 at most
@@ -295,20 +294,21 @@ class OtherMotion:
 
     @classmethod
     def of(cls, measurements: Measurements, by_tones: Array, residual: Array, differential: Array) -> "OtherMotion":
-        """From displacements (B, N, G, 2) of rows by the tones, and those left; the blur counts as expected."""
+        """From displacements (B, N, G, 2) of rows by the tones and the residuals; the blur counts as expected."""
         visible = measurements.num_differences > 0
         # sqrt(2): from the rms displacement about the mean of the frames to the offset of two of them
         size = math.sqrt(2) * np.sqrt(valid_mean(np.square(measurements.distances(by_tones)), 1))
-        is_far = (size[..., :2] > _FAR).any(-1, keepdims=True)
-        least = np.where(is_far, _VAGUE**-2, 0.0)[..., None]
-        measured = visible & (measurements.weights[..., :2] > least).all(-1)
-        registered, shown = (split_axis(rows, 1, measurements.groups, -1).sum(2) for rows in (measured, visible))
+        min_weight = np.where((size[..., :2] > _LARGE_OFFSET).any(-1, keepdims=True), _LARGE_STD**-2, 0.0)[..., None]
+        measured = visible & (measurements.weights[..., :2] > min_weight).all(-1)
+        counts = (split_axis(rows, 1, measurements.groups, -1).sum(2) for rows in (measured, visible))
+        num_measured, num_visible = counts
+        share = np.where(num_visible > 0, num_measured / np.maximum(num_visible, 1), 1.0)
         return cls(
             size=size,
             unexplained=np.maximum(measurements.unexplained(residual), measurements.of_worst_group(residual)),
             correlated=measurements.correlated(residual),
             differential=differential,
-            measured=(np.where(shown > 0, registered / np.maximum(shown, 1), 1.0) * shown.any(1, keepdims=True)).min(1),
+            measured=(share * num_visible.any(1, keepdims=True)).min(1),
             blur=np.broadcast_to(np.array([1.0, 0.0, 0.0]), (len(residual), 3)),
         )
 
@@ -316,29 +316,29 @@ class OtherMotion:
     def permitted(self) -> Array:
         """(..., 2) px, largest ``unexplained`` of a reliable axis: errors of interpolation and of unequal blur.
 
-        Of 22 right axes with offsets of 15 to 40 px, the largest rest was 0.007 px; frames that are compared at a wrong
-        place leave 0.12 px and more.
+        Of 22 right axes with offsets of 15 to 40 px, the largest residual was 0.007 px; frames that are compared at a
+        wrong place have 0.12 px and more.
         """
         return np.clip(0.006 * self.size, 0.05, 0.1)
 
     @property
     def explained(self) -> Array:
-        """(...) bool, whether the rest of all axes is permitted; not where no row was measured."""
+        """(...) bool, whether the residuals of all axes are permitted; False where no row was measured."""
         return np.all(self.unexplained <= self.permitted, -1)
 
 
 def cholesky_root(information: Array) -> Array:
     """Upper triangular R (..., A, A) with ``W = R^T R`` of information matrices W, rows of 0 where W is singular."""
     axes = information.shape[-1]
-    root, remainder = np.zeros_like(information), information
+    root, remaining = np.zeros_like(information), information
     for axis in range(axes):
-        square = remainder[..., :1, :1]
+        square = remaining[..., :1, :1]
         scale = (square > 0) / np.sqrt(np.where(square > 0, square, 1.0))
-        row = remainder[..., :1, :] * scale  # (..., 1, A - axis)
+        row = remaining[..., :1, :] * scale  # (..., 1, A - axis)
         root[..., axis, axis:] = row[..., 0, :]
         if axis + 1 < axes:
-            later = row[..., 1:]
-            remainder = remainder[..., 1:, 1:] - later.mT * later
+            coupling = row[..., 1:]
+            remaining = remaining[..., 1:, 1:] - coupling.mT * coupling
     return root
 
 

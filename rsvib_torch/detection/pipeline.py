@@ -32,7 +32,7 @@ from rsvib_torch.detection.tones.uncertainty import (
     with_unknown_image_motion,
     without_aliasing,
 )
-from rsvib_torch.detection.verdict import Findings, compared_bands, judged, scene_reasons, with_reasons_of_all
+from rsvib_torch.detection.verdict import Findings, compared_bands, judged, scene_reasons, with_common_reasons
 from rsvib_torch.frames.prepare import GreyFrames
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd, blind_frequencies
@@ -58,7 +58,7 @@ class DetectionOptions:
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """What an attempt assumes about the motion, and what earlier attempts have found."""
+    """Assumptions of an attempt on the motion, and the result of an earlier attempt."""
 
     scale: FieldScale  # components of the motion
     # whether the motion is assumed only because something contradicts a simpler one: roll and zoom because the halves
@@ -81,7 +81,7 @@ class Fitted:
 
 @dataclass(frozen=True, eq=False)
 class Attempt:
-    """What an attempt found, for B stacks in row order."""
+    """Result of an attempt, for B stacks in row order."""
 
     options: DetectionOptions  # the options
     scale: FieldScale  # components of the motion
@@ -120,8 +120,8 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
     # 2. Fit: tones and image motion, to the bands or to the rows.
     fitted = fit_directly(start, stacks, timing, options, hypothesis) if directly else fit_bands(start, timing, options)
 
-    # 3. Uncertainty: what the residual does not contain. Aliasing biases the displacements, and the record may contain
-    # a further tone. The displacement is that of every eighth row of all frames.
+    # 3. Uncertainty: errors that the residual does not show. Aliasing biases the displacements, and the record may
+    # contain a further tone. The displacement is computed for every eighth row of all frames.
     intervals = compared_intervals(timing, num_frames, MAX_GROUP_FRAMES if directly else 2)
     row_starts = table(timing.row_starts(num_frames, height)[:, ::8].flatten())
     measurements, fit, refined = fitted.measurements, fitted.fit, fitted.refined
@@ -130,12 +130,12 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
         unexplained, span = refined.other_motion.unexplained, measurements.span
         fit = with_unknown_amplitudes(fit, refined.aliasing, unexplained, intervals, timing.exposure_time, span=span)
     known_std = displacement_std(fit, row_starts, timing.exposure_time)
-    stated, if_hidden = with_further_tones(measurements, fit, row_starts, number_is_known=options.tones is not None)
+    fits = [*with_further_tones(measurements, fit, row_starts, number_is_known=options.tones is not None)]
+    interval = float(intervals[0])
     if refined is not None:
-        spacing, exposure = float(intervals[0]), timing.exposure_time
-        stated, if_hidden = (with_unknown_image_motion(one, spacing, exposure) for one in (stated, if_hidden))
-    vibration, std = stated.vibration()
-    fit, std_if_hidden_tone = if_hidden.fit, if_hidden.vibration()[1]
+        fits = [with_unknown_image_motion(fit, interval, timing.exposure_time) for fit in fits]
+    (vibration, std), (_, std_if_hidden_tone) = (fit.vibration() for fit in fits)
+    fit = fits[1].fit
 
     # 4. Verdict: for each axis, the reasons against it, from the rows or the bands that the vibration was fitted to.
     findings = judged(
@@ -150,9 +150,7 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
         radius=scale.radius,
     )
     if scale.same_for_all_columns:
-        against = zip(scene_reasons(start.curve, scale.width), findings, strict=True)
-        findings = tuple(with_reasons_of_all(of_scene, of_stack) for of_scene, of_stack in against)
-    interval = float(intervals[0])
+        findings = tuple(map(with_common_reasons, scene_reasons(start.curve, scale.width), findings))
     return Attempt(options, scale, start, fitted, fit, vibration, std, std_if_hidden_tone, findings, interval)
 
 
@@ -187,12 +185,12 @@ def fit_directly(
     scale, doubtful = hypothesis.scale, hypothesis.is_doubtful
     if scale.same_for_all_columns:
         frames = grouped_frames(stacks.images, stacks.valid, timing, motion)
-    else:  # pairs take several times as long, and are not needed to find that there is no roll
+    else:  # pairs take several times as long, and are not needed to show that there is no roll
         frames = grouped_strips(stacks.images, stacks.valid, timing, motion, scale, pairs=not doubtful)
     refined = refine(frames, intervals, fit, options.tones, may_abandon=doubtful)
-    # Bands that move within their height contain twice the frequency of a tone, as a tone that is larger than the frame
-    # if it is nearly blind (3 of 200 recordings in four and eight frames), or none (1 of 60 in two frames, with another
-    # axis that was wrong): where the rows contradict the fit, one tone of each axis is tried.
+    # The offsets of bands that move within their height contain twice the frequency of a tone. It may be fitted by a
+    # nearly blind tone larger than the frame (3 of 200 recordings in four and eight frames), or no tone may be found (1
+    # of 60 in two frames, with another axis that was wrong). Where rows contradict the fit, one tone per axis is tried.
     contradicted = ~refined.other_motion.explained & ~refined.abandoned
     if options.tones is None and contradicted.any():
         index = np.flatnonzero(contradicted)
@@ -217,5 +215,5 @@ def _tones_of_bands(start: BandStart, timing: RowTiming, options: DetectionOptio
     """Tones and image motion of the offsets of row bands; further tones until residuals are below ``accuracy`` px."""
     interval = options.bands.band_step * timing.row_time
     blind = table(blind_frequencies(timing, 0.5 / interval))
-    chosen = options.tones, options.drift_order
-    return find_tones(start.measurements, interval, *chosen, start=start.fit, blind=blind, accuracy=accuracy)
+    tones, order = options.tones, options.drift_order
+    return find_tones(start.measurements, interval, tones, order, start=start.fit, blind=blind, accuracy=accuracy)

@@ -63,7 +63,7 @@ class FittedRows:
     uneven: Array  # (B, 2) px, differences of the displacements along a row that roll and zoom cannot explain
     frames: GroupedFrames  # the frames; without a pattern of columns if there was one
     row_variance: Array  # (B, M, S) residual variance of the S rows of the M groups of frames
-    unknown: Array  # (B, A P, A P) covariance of what the last rounds changed; 0 for stacks that converged
+    unknown: Array  # (B, A P, A P) covariance by the changes in the last rounds; 0 for stacks that converged
     abandoned: Array  # (B,) bool, stacks whose large residual ended the rounds early
 
 
@@ -90,12 +90,12 @@ def refine(
         index = np.flatnonzero(has_pattern)
         cleaned = refined.frames.without(pattern)
         from_fit = take_stacks([refined.fit], index)
-        again = _rounds(cleaned.stacks(index), intervals, from_fit, tones, search_round=0)
-        refined = replace(_with_stacks(refined, again, index), frames=cleaned)
+        refitted = _rounds(cleaned.stacks(index), intervals, from_fit, tones, search_round=0)
+        refined = replace(_with_stacks(refined, refitted, index), frames=cleaned)
     # 3. A long exposure can make the start choose the wrong side of a blind frequency: the other side is tried as well,
     # one axis after the other.
     blurred = frames.differently_blurred(motion_of_fit(shrunk(start, intervals), device))
-    # other axes, and those of abandoned stacks, count as tried
+    # the axes without this risk, and those of abandoned stacks, count as tried
     tried = ~(blurred[:, None] | _is_nearly_blind(refined.fit, intervals)) | refined.abandoned[:, None]
     while not tried.all():
         frequencies, mirrored = mirrored_frequencies(refined.measurements, refined.fit, start, tried)
@@ -103,15 +103,15 @@ def refine(
             break
         tried = tried | mirrored
         active, index = strongest_only(refined.fit).active, np.flatnonzero(mirrored.any(-1))
-        other, _ = robust_fit(refined.measurements, frequencies, active, start.drift_order)
+        mirrored_fit, _ = robust_fit(refined.measurements, frequencies, active, start.drift_order)
         # a pattern that was subtracted does not appear again
-        from_fit = take_stacks([other], index)
-        again = _rounds(refined.frames.stacks(index), intervals, from_fit, tones, may_abandon=may_abandon)
-        refined = with_better(refined, again, index)
+        from_fit = take_stacks([mirrored_fit], index)
+        refitted = _rounds(refined.frames.stacks(index), intervals, from_fit, tones, may_abandon=may_abandon)
+        refined = with_better(refined, refitted, index)
     # 4. Tones that the exact fit does not confirm are left out.
     if tones is None:
         fit = significant_only(refined.measurements, refined.fit, intervals)
-        if fit is not refined.fit:  # it was fitted again, without what the last rounds changed
+        if fit is not refined.fit:  # it was fitted again, so that its covariance lacks the changes in the last rounds
             refined = replace(refined, fit=replace(fit, covariance=fit.covariance + refined.unknown))
     # 5. The difference of the blur of the frames, by the final motion, contradicts a wrong exposure time.
     blur = table(refined.frames.blur_ratio(motion_of_fit(shrunk(refined.fit, intervals), device)))
@@ -135,30 +135,30 @@ def _rounds(
         running.step()
         finished = running.ended | running.settled
         if finished.any():
-            part = running.only(finished)
-            results, stacks = [*results, part.result()], [*stacks, part.stacks]
+            finished_part = running.only(finished)
+            results, stacks = [*results, finished_part.result()], [*stacks, finished_part.stacks]
         if finished.all():
             break
         running = running.only(~finished)
         running.accelerate()
-    return replace(_taken(results, np.concatenate(stacks).argsort()), frames=frames)
+    return replace(_joined_results(results, np.concatenate(stacks).argsort()), frames=frames)
 
 
-def _taken(results: Sequence[FittedRows], index: Array) -> FittedRows:
+def _joined_results(results: Sequence[FittedRows], index: Array) -> FittedRows:
     """``take_stacks`` of results with different numbers of tones."""
-    count = max(one.fit.active.shape[-1] for one in results)
+    count = max(result.fit.active.shape[-1] for result in results)
     roomy = [
-        replace(one, fit=with_tones(one.fit, count), unknown=covariance_with_tones(one.unknown, one.fit, count))
-        for one in results
+        replace(rows, fit=with_tones(rows.fit, count), unknown=covariance_with_tones(rows.unknown, rows.fit, count))
+        for rows in results
     ]
     return take_stacks(roomy, index)
 
 
-def _with_stacks(first: FittedRows, second: FittedRows, index: Array) -> FittedRows:
-    """The result with those of other rounds in place of the stacks ``index``."""
-    place = np.arange(len(first.unknown))
+def _with_stacks(result: FittedRows, replacement: FittedRows, index: Array) -> FittedRows:
+    """The result of a batch, with the ``replacement`` of its stacks ``index``."""
+    place = np.arange(len(result.unknown))
     place[index] = len(place) + np.arange(len(index))
-    return _taken([first, second], place)
+    return _joined_results([result, replacement], place)
 
 
 class Refinement:
@@ -186,8 +186,8 @@ class Refinement:
         self.around = self.warped_by = shrunk(start, intervals)
         self.round, self.search_round = 0, search_round  # the next round
         self.stacks = np.arange(len(start.centre))  # (B,) indices in the batch
-        # (B,) bool: stacks that no further round is permitted for, or would help; others that need none; those whose
-        # next round would change little; those that are abandoned
+        # (B,) bool: stacks that end without convergence, stacks that need no further round, stacks whose next round
+        # would change little, and abandoned stacks
         self.ended = self.settled = self.converged = self.abandoned = np.zeros_like(start.centre, dtype=bool)
         self._intervals, self._tones, self._may_abandon = intervals, tones, may_abandon
         # exposures average out faster tones
@@ -222,8 +222,8 @@ class Refinement:
         # 2. Fit the motion to them, and keep the last fit of a stack whose fit diverges.
         fit = self._searched(measurements, residual) if number == self.search_round else None
         if fit is None:
-            of_tones = previous.frequencies, previous.active, previous.drift_order
-            fit = robust_fit(measurements, *of_tones, residual, steps=1)[0]
+            tones = previous.frequencies, previous.active, previous.drift_order
+            fit = robust_fit(measurements, *tones, residual, steps=1)[0]
         fit = self.fit = self._bounded(fit, previous)
         same_tones = number > self.search_round and np.array_equal(previous.active, fit.active)
         self._fits = [*self._fits, fit] if same_tones else [fit]
@@ -233,8 +233,8 @@ class Refinement:
         # 3. Stacks that no further round would help: those whose rows are not measured, and those whose hypothesis
         # leaves a large residual.
         if self._may_abandon and self.round == _TRIED_ROUNDS:
-            other = conclude(self.frames, measured, self.fit).other_motion
-            self.abandoned = np.any(other.unexplained > _MAX_RESIDUAL * other.permitted, -1)
+            other_motion = conclude(self.frames, measured, self.fit).other_motion
+            self.abandoned = np.any(other_motion.unexplained > _MAX_RESIDUAL * other_motion.permitted, -1)
         self.ended = self.abandoned | ~(measurements.weights > 0).any((1, 2)) | (self.round == _MAX_ROUNDS)
 
         # 4. Settled stacks: the next round would change the motion by much less than its standard deviation, or the
@@ -259,27 +259,27 @@ class Refinement:
             self._gradients = None
 
     def only(self, where: Array) -> "Refinement":
-        """The refinement of the stacks ``where`` (B,) is true."""
+        """The refinement of the stacks where ``where`` (B,) is true."""
         if where.all():
             return self
-        index, part = np.flatnonzero(where), copy(self)
-        part.frames, part._measured = self.frames.stacks(index), self._measured.stacks(index)
+        index, selection = np.flatnonzero(where), copy(self)
+        selection.frames, selection._measured = self.frames.stacks(index), self._measured.stacks(index)
         for name in ("fit", "around", "warped_by", "_step"):
-            setattr(part, name, take_stacks([getattr(self, name)], index))
-        part._fits = [take_stacks([fit], index) for fit in self._fits]
-        part._acceleration = Acceleration([take_stacks([step], index) for step in self._acceleration.steps])
-        part._sizes = [size[index] for size in self._sizes]
+            setattr(selection, name, take_stacks([getattr(self, name)], index))
+        selection._fits = [take_stacks([fit], index) for fit in self._fits]
+        selection._acceleration = Acceleration([take_stacks([step], index) for step in self._acceleration.steps])
+        selection._sizes = [size[index] for size in self._sizes]
         for name in ("stacks", "ended", "settled", "converged", "abandoned", "_stalled"):
-            setattr(part, name, getattr(self, name)[index])
+            setattr(selection, name, getattr(self, name)[index])
         if self._gradients is not None:
-            part._gradients = part._measured.gradients
-        return part
+            selection._gradients = selection._measured.gradients
+        return selection
 
     def result(self) -> FittedRows:
         """The last measurements, with the exact fit to them.
 
-        If the rounds did not converge, what they changed is not known. The change of the displacements by the last one
-        counts as motion that is not explained, for all axes, because the displacement along one determines which rows
+        If the rounds did not converge, the error that remains is not known. The change of the displacements by the last
+        round counts as unexplained motion, for all axes, because the displacement along one determines which rows
         are compared along the other: tones of 10 to 40 px in three frames with a long exposure were wrong, with a
         permitted residual. The changes of the parameters by the last rounds count as errors of unknown sign: tones near
         blind frequencies with long exposures had errors of 4 to 18 standard deviations without them.
@@ -288,16 +288,16 @@ class Refinement:
         unknown = ~(self.converged | self.abandoned)
         if not bool(unknown.any()):
             return fitted
-        measurements, fit, other = fitted.measurements, fitted.fit, fitted.other_motion
-        change = Step.between(measurements, self.warped_by, self.around).change
+        measurements, fit, other_motion = fitted.measurements, fitted.fit, fitted.other_motion
+        change, permitted = Step.between(measurements, self.warped_by, self.around).change, other_motion.permitted
         distance = np.sqrt(without_nan(valid_mean(np.square(measurements.distances(change)), 1), 0.0))
-        least = (distance * unknown[:, None] / other.permitted).max(-1, keepdims=True) * other.permitted
-        changes = [(one.about(fit.centre).parameters - fit.parameters).reshape(len(unknown), -1) for one in self._fits]
-        columns = np.stack(changes, -1) * unknown[:, None, None]
-        covariance = columns @ columns.mT
+        least = (distance * unknown[:, None] / permitted).max(-1, keepdims=True) * permitted
+        changes = np.stack([past.about(fit.centre).parameters - fit.parameters for past in self._fits], -1)
+        changes = changes.reshape(len(unknown), -1, len(self._fits)) * unknown[:, None, None]
+        covariance = changes @ changes.mT
         return replace(
             fitted,
-            other_motion=replace(other, unexplained=np.maximum(other.unexplained, least)),
+            other_motion=replace(other_motion, unexplained=np.maximum(other_motion.unexplained, least)),
             fit=replace(fit, covariance=fit.covariance + covariance),
             unknown=covariance,
         )
@@ -320,15 +320,15 @@ class Refinement:
     def _refused_for_good(self, measured: MeasuredRows) -> Array:
         """(B, A) bool, axes whose typical residual hardly decreased in two rounds, and which are refused because of it.
 
-        A quarter in two rounds is too little to reach what is permitted in the rounds that remain.
+        A decrease by a quarter in two rounds is too slow to reach a permitted residual in the rounds that remain.
         """
         stalled = np.zeros_like(self.fit.active[..., 0])
         if len(self._sizes) > 2:
             stalled = self._sizes[-1] > 0.75 * self._sizes[-3]
         if not stalled.any():
             return stalled
-        other = conclude(self.frames, measured, self.fit).other_motion
-        return stalled & (other.unexplained > other.permitted)
+        other_motion = conclude(self.frames, measured, self.fit).other_motion
+        return stalled & (other_motion.unexplained > other_motion.permitted)
 
 
 # rounds before the test; residual over the one that the verdict permits. Roll and zoom leave 0.1 of it, parallax 2 to
@@ -345,11 +345,11 @@ def conclude(frames: GroupedFrames, measured: MeasuredRows, fit: ToneFit) -> Fit
     weighted = measurements.weighed(residual)
     fit = fitted_again(weighted, fit)
     tones = model_displacements(measurements, replace(fit, drift=np.zeros_like(fit.drift)))
-    other = OtherMotion.of(measurements, tones, residual, measured.differential())
+    other_motion = OtherMotion.of(measurements, tones, residual, measured.differential())
     return FittedRows(
         weighted,
         fit,
-        other,
+        other_motion,
         robust_weights=weighted.weights / np.maximum(measurements.weights, 1e-300),
         aliasing=measured.aliasing(),
         uneven=measured.uneven(),
@@ -372,8 +372,8 @@ def mirrored_frequencies(measurements: Measurements, fit: ToneFit, start: ToneFi
 
     With two frames a time T apart, tones equally far above and below a blind frequency ``j / T`` have the same gain and
     differ only within a frame. The fit, refined from ``start``, may be at the wrong side. The result has frequencies
-    (B, A, 1) in Hz and the axes (B, A) that are mirrored, at most one of each stack that was not ``tried`` (B, A):
-    those with a residual of three standard deviations in the typical row, and frequencies that a frame does not
+    (B, A, 1) in Hz and the axes (B, A) that are mirrored, at most one of each stack, where ``tried`` (B, A) is false:
+    those with a residual of three standard deviations in the typical row, and with frequencies that a frame does not
     resolve.
     """
     strongest = strongest_only(fit)
@@ -384,8 +384,8 @@ def mirrored_frequencies(measurements: Measurements, fit: ToneFit, start: ToneFi
     frequency = strongest_only(start).frequencies[..., 0]
     mirrored = 2 * (frequency * interval).round() / interval - frequency
     unresolved = (np.abs(mirrored - frequency) * duration < 0.35) & (mirrored > 0) & strongest.active[..., 0]
-    wrong = (residual > 3.0) & (residual == residual.max(-1, keepdims=True))
-    where = unresolved & ~tried & (wrong | _is_nearly_blind(fit, interval[0]))
+    poor = (residual > 3.0) & (residual == residual.max(-1, keepdims=True))
+    where = unresolved & ~tried & (poor | _is_nearly_blind(fit, interval[0]))
     if exposure_starts.shape[2] > 2:
         where = np.zeros_like(where)
     return np.where(where, mirrored, strongest.frequencies[..., 0])[..., None], where
@@ -397,11 +397,11 @@ def _is_nearly_blind(fit: ToneFit, intervals: Array) -> Array:
     return strongest.active[..., 0] & (offset_gain(strongest.frequencies, intervals)[..., 0] < _SMALL_GAIN)
 
 
-def with_better(first: FittedRows, second: FittedRows, index: Array) -> FittedRows:
-    """The result with another one of the stacks ``index`` where its residual in the typical row is smaller or known.
+def with_better(result: FittedRows, other: FittedRows, index: Array) -> FittedRows:
+    """The result of a batch, with the ``other`` result of its stacks ``index`` where that fits better.
 
-    Abandoned stacks of the other one do not count.
+    A fit is better if its residual of the typical row is smaller or the only one known, and it was not abandoned.
     """
-    sizes = typical_size(first.measurements, first.fit)[index], typical_size(second.measurements, second.fit)
-    better = np.flatnonzero((sizes[1] < without_nan(sizes[0], np.inf)) & ~second.abandoned)
-    return replace(_with_stacks(first, take_stacks([second], better), index[better]), abandoned=first.abandoned)
+    size = without_nan(typical_size(result.measurements, result.fit)[index], np.inf)
+    better = np.flatnonzero((typical_size(other.measurements, other.fit) < size) & ~other.abandoned)
+    return replace(_with_stacks(result, take_stacks([other], better), index[better]), abandoned=result.abandoned)

@@ -99,8 +99,8 @@ class DetectionResult(
 
     def _middle_time(self, batch: tuple[int, ...]) -> float | None:
         curve, exposure_time = self.offsets, 0.0 if self.timing is None else self.timing.exposure_time
-        part = batch if curve.times.ndim > 2 else ()  # stacks of one timing have their times in common
-        return 0.5 * (float(curve.times[part].min()) + float(curve.later_times[part].max()) + exposure_time)
+        selection = batch if curve.times.ndim > 2 else ()  # stacks of one timing have their times in common
+        return 0.5 * (float(curve.times[selection].min()) + float(curve.later_times[selection].max()) + exposure_time)
 
     def with_axes(self, count: int) -> "DetectionResult":
         """The result with the first axes of (x, y, roll, zoom) only."""
@@ -110,8 +110,8 @@ class DetectionResult(
             """The first axes of values (..., A), or (..., A, K) of tones."""
             return values[..., :count, :] if values.ndim == batch + 2 else values[..., :count]
 
-        def of_findings(findings: Findings, depth: int) -> Findings:
-            return findings[:count] if depth == 0 else tuple(of_findings(part, depth - 1) for part in findings)
+        def first_findings(findings: Findings, depth: int) -> Findings:
+            return findings[:count] if depth == 0 else tuple(first_findings(part, depth - 1) for part in findings)
 
         curve, hidden = self.offsets, self.std_if_hidden_tone
         std = None if curve.std is None else curve.std[..., :count]
@@ -123,7 +123,7 @@ class DetectionResult(
             gain=first(self.gain),
             residual=first(self.residual),
             reliable=first(self.reliable),
-            findings=of_findings(self.findings, batch),
+            findings=first_findings(self.findings, batch),
             offsets=replace(curve, offsets=curve.offsets[..., :count], std=std),
             fitted=self.fitted[..., :count],
             sensitivity=self.sensitivity.mapped(first),
@@ -156,12 +156,12 @@ def assembled(
     sensitivity = timing_sensitivity(fit, row_timing, num_frames, scale.height)
     sensitivity = sensitivity.mapped(lambda values: magnitudes_from_row_order(values, timing, -2))
     residual = (curve.offsets - predicted).abs().nanmean(dim=(1, 2))
-    reliable = [[not of_axis for of_axis in of_stack] for of_stack in findings]
+    reliable = [[not reasons for reasons in stack_findings] for stack_findings in findings]
     # The axes of a stack have one timing, which the rows of one of them may contradict.
-    contradicted = [any(contradicted_axes(of_stack)) and not all(of_stack) for of_stack in findings]
+    contradicted = [any(contradicted_axes(stack_findings)) and not all(stack_findings) for stack_findings in findings]
     stds = [
-        of and with_row_time_std(scale.std(of).from_row_order(timing), vibration, sensitivity, timing)
-        for of in (std, std_if_hidden_tone)
+        px_std and with_row_time_std(scale.std(px_std).from_row_order(timing), vibration, sensitivity, timing)
+        for px_std in (std, std_if_hidden_tone)
     ]
     assert stds[0] is not None
     return DetectionResult(
@@ -177,7 +177,7 @@ def assembled(
         gain=vibration.gain(interval),
         residual=magnitudes_from_row_order(residual * units, timing),
         reliable=magnitudes_from_row_order(torch.tensor(reliable, device="cpu"), timing),
-        findings=tuple(findings_from_row_order(of_stack, timing) for of_stack in findings),
+        findings=tuple(findings_from_row_order(stack_findings, timing) for stack_findings in findings),
         sensitivity=sensitivity,
         assumptions=assumptions(vibration, sensitivity, row_timing, num_frames, scale.height, blur, contradicted),
         timing=timing,
@@ -219,5 +219,4 @@ def offset_curve(
         "std": np.sqrt(np.where(weights > 0, 2.0 * robust / np.maximum(weights, 1e-300), np.nan)),  # of a difference
     }
     on_device = {name: torch.from_numpy(array).to(device) for name, array in values.items()}
-    curve = OffsetCurve(**on_device, heights=(BLOCK_ROWS, BLOCK_ROWS))
-    return curve, fitted_after - fitted_before
+    return OffsetCurve(**on_device, heights=(BLOCK_ROWS, BLOCK_ROWS)), fitted_after - fitted_before

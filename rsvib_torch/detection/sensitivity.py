@@ -52,7 +52,7 @@ _STEP = 1e-4  # relative change of the timing, for differences
 
 
 def timing_sensitivity(fit: ToneFit, timing: RowTiming, num_frames: int, num_rows: int) -> TimingSensitivity:
-    """Sensitivities (B, 2, K) of the tones of a fit to the timing, in row order, as of ``vibration_of_fit``.
+    """Sensitivities (B, 2, K) of the tones of a fit to the timing, in row order, in the order of ``vibration_of_fit``.
 
     A timing that is wrong by dT changes the displacements at the measured times by ``dD``. The least-squares fit then
     changes its parameters by ``-X^+ dD`` to first order, X the Jacobian of the displacements of about 128 rows of all
@@ -61,18 +61,18 @@ def timing_sensitivity(fit: ToneFit, timing: RowTiming, num_frames: int, num_row
     batch, axes, tones = fit.coefficients.shape
 
     # 1. A record of all rows of all frames, and the fit at its middle.
-    def record(stated: RowTiming) -> Measurements:
-        rows = stated.row_time * np.arange(0, num_rows, max(1, num_rows // 128))
-        times = np.repeat((rows[:, None] + table(stated.frame_starts(num_frames)))[None], batch, 0)  # (B, N, T)
+    def record(record_timing: RowTiming) -> Measurements:
+        rows = record_timing.row_time * np.arange(0, num_rows, max(1, num_rows // 128))
+        times = np.repeat((rows[:, None] + table(record_timing.frame_starts(num_frames)))[None], batch, 0)  # (B, N, T)
         information = np.broadcast_to(np.eye(axes), (*times.shape[:2], axes, axes))
-        nothing = np.zeros((*times.shape, axes))
-        return Measurements(times, nothing, np.ones_like(times), information, stated.exposure_time)
+        zeros = np.zeros((*times.shape, axes))
+        return Measurements(times, zeros, np.ones_like(times), information, record_timing.exposure_time)
 
-    whole = record(timing)
-    fit = fit.about(whole.centre)
+    measurements = record(timing)
+    fit = fit.about(measurements.centre)
 
     # 2. The pseudo-inverse of the derivatives of the displacements of each axis by its parameters.
-    jacobian = free_jacobian(whole, fit)
+    jacobian = free_jacobian(measurements, fit)
     columns = np.moveaxis(jacobian, 3, 1).reshape(batch, axes, -1, jacobian.shape[-1])
     inverses = pseudo_inverse(columns)  # (B, A, P, D)
 
@@ -81,18 +81,17 @@ def timing_sensitivity(fit: ToneFit, timing: RowTiming, num_frames: int, num_row
     largest_first = (-fit.amplitude).argsort(-1, stable=True)
     size = np.where(fit.amplitude > 1e-9, fit.amplitude, 1.0)  # px or rad; a tone that has decayed does not count
     for name in ("row_time", "frame_rows", "exposure_rows"):
-        stated = getattr(timing, name)
-        timings = [replace(timing, **{name: stated * (1 + sign * _STEP)}) for sign in (-1, 1)]
-        lower, higher = (model_displacements(record(one), fit) for one in timings)
+        timings = [replace(timing, **{name: getattr(timing, name) * (1 + sign * _STEP)}) for sign in (-1, 1)]
+        lower, higher = (model_displacements(record(changed_timing), fit) for changed_timing in timings)
         change = (higher - lower) / (2 * _STEP)
-        changes = -inverses @ np.moveaxis(change, -1, 1).reshape(batch, axes, -1, 1)
-        by_tones = split_axis(changes[:, :, : 3 * tones, 0], -1, tones, 3)
+        parameter_changes = -inverses @ np.moveaxis(change, -1, 1).reshape(batch, axes, -1, 1)
+        by_tones = split_axis(parameter_changes[:, :, : 3 * tones, 0], -1, tones, 3)
         along = fit.coefficients.conj() * (by_tones[..., 0] + 1j * by_tones[..., 1])
         amplitude = np.where(fit.active, along.real / np.square(size), 0.0)
         frequency = np.where(fit.active, by_tones[..., 2] / np.maximum(fit.frequencies, 1e-300), 0.0)
         # the phase at the time origin instead of the middle of the record
-        turned = np.where(fit.active, along.imag / np.square(size), 0.0)
-        phase = turned - 2 * math.pi * fit.frequencies * frequency * fit.centre[:, None, None]
+        phase_change = np.where(fit.active, along.imag / np.square(size), 0.0)
+        phase = phase_change - 2 * math.pi * fit.frequencies * frequency * fit.centre[:, None, None]
         for of, change in (("amplitude", amplitude), ("frequency", frequency), ("phase", phase)):
             values[f"{of}_by_{name}"] = torch.from_numpy(np.take_along_axis(change, largest_first, -1))
     return TimingSensitivity(**values)
@@ -101,7 +100,7 @@ def timing_sensitivity(fit: ToneFit, timing: RowTiming, num_frames: int, num_row
 def with_row_time_std(
     std: VibrationStd, vibration: Vibration, sensitivity: TimingSensitivity, timing: SensorTiming | RowTiming
 ) -> VibrationStd:
-    """Standard deviations of tones with that of the row time, which exposure and frame period in s do not share."""
+    """Standard deviations of tones, with the effect of that of the row time at known exposure and frame period in s."""
     if not timing.row_time_std:
         return std
     by_row_time, by_frame_rows, by_exposure_rows = (
@@ -124,8 +123,8 @@ def displacements_by_row_time(measured: Measurements, motion: Motion, timing: Ro
     times, starts = measured.exposure_starts, table(timing.frame_starts(num_frames))
     frames = np.searchsorted(starts, times + 0.5 * timing.row_time, "right") - 1
     later = times + (timing.row_time_std / timing.row_time) * (times - starts[np.maximum(frames, 0)])
-    displacements = [table(motion.mean_displacement(tensor(at), measured.exposure_time)) for at in (times, later)]
-    return measured.relative(displacements[1] - displacements[0])
+    before, after = (motion.mean_displacement(tensor(values), measured.exposure_time) for values in (times, later))
+    return measured.relative(table(after - before))
 
 
 def assumptions(
@@ -137,10 +136,10 @@ def assumptions(
     blur: Array | None = None,
     contradicted: Sequence[bool] = (),
 ) -> tuple[tuple[str, ...], ...]:
-    """What frames cannot contradict, with its effect on vibrations (B) in image axes; ``blur`` of ``OtherMotion``.
+    """Assumptions that frames cannot contradict, with their effect on vibrations (B) in image axes, for each stack.
 
-    ``contradicted``: whether the rows contradict one axis of a stack, which a wrong timing of all of them may cause.
-    With the readout in the wrong direction, two axes of 28 were reliable beside such an axis, and wrong.
+    ``blur`` as in ``OtherMotion``. ``contradicted``: whether the rows contradict one axis of a stack, of which a wrong
+    timing may be the cause. With the wrong readout direction, 2 of 28 axes beside such an axis were reliable and wrong.
     """
     # 1. Sentences about all stacks.
     sentences, times = [], ["exposure_rows"]
@@ -155,9 +154,9 @@ def assumptions(
         )
     intervals = other_intervals(timing, timing.frame_starts(num_frames), num_rows)
     if intervals is not None:
-        listed = " to ".join(dict.fromkeys(f"{interval:.4g}" for interval in intervals))
+        interval_texts = " to ".join(dict.fromkeys(f"{interval:.4g}" for interval in intervals))
         sentences.append(
-            f"frame_start_times {listed} s apart, although the frame period is "
+            f"frame_start_times {interval_texts} s apart, although the frame period is "
             f"{timing.frame_period:.4g} s (frame_rows x row_time); wrong times give wrong frequencies"
         )
     if timing.frame_start_times is None and timing.frame_rows == num_rows:
@@ -166,20 +165,20 @@ def assumptions(
             "otherwise frame_rows, and a row_time of 1 / (frame rate x rows), are wrong"
         )
     if num_frames == 2:
-        what = "frame_rows" if timing.frame_start_times is None else "row_time, frame_start_times"
+        settings = "frame_rows" if timing.frame_start_times is None else "row_time, frame_start_times"
         sentences.append(
-            f"{what}, readout direction, scan axis and order of the frames: two frames cannot contradict them, more "
-            "frames can"
+            f"{settings}, readout direction, scan axis and order of the frames: two frames cannot contradict them, "
+            "more frames can"
         )
-        times.insert(0, what.partition(",")[0])
+        times.insert(0, settings.partition(",")[0])
     # 2. Effects on the tones of each stack.
     amplitudes, frequencies = tables(vibration.amplitude, vibration.frequency)
     changes = {name: tables(*(getattr(sensitivity, f"{of}_by_{name}") for of in _TONE_VALUES)) for name in times}
-    of_stacks = []
+    sentences_of_stacks = []
     for stack, frequency in enumerate(frequencies):
         tones = [(axis, tone, float(frequency[axis, tone])) for axis, tone in np.argwhere(amplitudes[stack] > 0)]
-        of_stack = [(name, [change[stack] for change in changes[name]]) for name in times]
-        effects = [text for name, change in of_stack for text in _effects(name, tones, change, timing)]
+        tone_changes = [(name, [change[stack] for change in changes[name]]) for name in times]
+        effects = [text for name, change in tone_changes for text in _effects(name, tones, change, timing)]
         if blur is not None:
             effects += _exposure_range(tones, timing, *blur[stack, :2].tolist())
         effects += _tones_of_lamps(tones, amplitudes[stack], 0.1 / (num_frames * timing.frame_period))
@@ -188,8 +187,8 @@ def assumptions(
                 "readout direction, frame_rows and row_time: the tones of the other axis are not known, as with a "
                 "wrong timing; the motion along it may also be none of tones"
             )
-        of_stacks.append((*sentences, *effects) if tones else ())
-    return tuple(of_stacks)
+        sentences_of_stacks.append((*sentences, *effects) if tones else ())
+    return tuple(sentences_of_stacks)
 
 
 _Tones = list[tuple[int, int, float]]  # axis, number and frequency in Hz of each tone
@@ -205,23 +204,23 @@ def _tones_of_lamps(tones: _Tones, amplitudes: Array, tolerance: float) -> list[
     pairs = [(weak, strong) for weak in tones for strong in tones if weak[0] == strong[0]]
     texts = [
         f"{AXIS_NAMES[axis]} {weak:.4g} Hz ({lamp:g} {'+' if weak > lamp else '-'} {strong:.4g} Hz)"
-        for (axis, tone, weak), (_, other, strong) in pairs
+        for (axis, tone, weak), (_, strong_tone, strong) in pairs
         for lamp in (100.0, 120.0)
-        if amplitudes[axis, tone] < 0.1 * amplitudes[axis, other] and abs(abs(weak - lamp) - strong) < tolerance
+        if amplitudes[axis, tone] < 0.1 * amplitudes[axis, strong_tone] and abs(abs(weak - lamp) - strong) < tolerance
     ]
     return [f"steady light; a lamp that flickers also causes tones: {', '.join(texts)}"] if texts else []
 
 
 def _effects(name: str, tones: _Tones, changes: list[Array], timing: RowTiming) -> list[str]:
     """Sentence about the effect of an error of 1 % of a stated time on every tone; none if all are below 0.1 %."""
-    of_tones = []
+    tone_texts = []
     for axis, tone, frequency in tones:
-        of_tone = zip(_TONE_VALUES, (change[axis, tone] for change in changes), strict=True)
-        texts = [f"{of} {change:+.2g} %" for of, change in of_tone if abs(change) > 0.1]
+        tone_changes = zip(_TONE_VALUES, (change[axis, tone] for change in changes), strict=True)
+        texts = [f"{of} {change:+.2g} %" for of, change in tone_changes if abs(change) > 0.1]
         if texts:
-            of_tones.append(f"{AXIS_NAMES[axis]} {frequency:.4g} Hz: {', '.join(texts)}")
-    stated = f"{name}={getattr(timing, name):g}"
-    return [f"{stated}: if it is stated 1 % too large, this changes {'; '.join(of_tones)}"] if of_tones else []
+            tone_texts.append(f"{AXIS_NAMES[axis]} {frequency:.4g} Hz: {', '.join(texts)}")
+    setting = f"{name}={getattr(timing, name):g}"
+    return [f"{setting}: if it is stated 1 % too large, this changes {'; '.join(tone_texts)}"] if tone_texts else []
 
 
 def _exposure_range(tones: _Tones, timing: RowTiming, ratio: float, std: float) -> list[str]:
@@ -229,20 +228,20 @@ def _exposure_range(tones: _Tones, timing: RowTiming, ratio: float, std: float) 
 
     The rows determine ``A sinc(f T_e)`` (Eq. 2). There is no sentence if no amplitude changes by more than 1 %.
     """
-    stated = timing.exposure_time
-    low, high = (min(stated * math.sqrt(max(ratio + 2 * n * std, 0.0)), timing.frame_period) for n in (-1, 1))
-    of_tones = []
+    exposure = timing.exposure_time
+    low, high = (min(exposure * math.sqrt(max(ratio + 2 * n * std, 0.0)), timing.frame_period) for n in (-1, 1))
+    tone_texts = []
     for axis, _, frequency in (tone for tone in tones if tone[0] < 2):
         # an exposure of a period averages the tone out; a fit without meaning may have a frequency of 0
         longest = min(high, 0.9 / frequency) if frequency else high
-        changes = [100 * (np.sinc(frequency * stated) / np.sinc(frequency * time) - 1) for time in (low, longest)]
-        if low < longest and frequency * stated < 0.9 and max(map(abs, changes)) > 1.0:
+        changes = [100 * (np.sinc(frequency * exposure) / np.sinc(frequency * time) - 1) for time in (low, longest)]
+        if low < longest and frequency * exposure < 0.9 and max(map(abs, changes)) > 1.0:
             more = " and more" if longest < high else ""
             name = f"{AXIS_NAMES[axis]} {frequency:.4g} Hz"
             # the phase is measured in the middle of the exposure, and stated for its start
-            turns = [math.pi * frequency * (stated - time) for time in (low, longest)]
+            turns = [math.pi * frequency * (exposure - time) for time in (low, longest)]
             amplitude, phase = ("{:+.2g} to {:+.2g}".format(*values) for values in (changes, turns))
-            of_tones.append(f"{name}: amplitude {amplitude} %, phase {phase} rad{more}")
+            tone_texts.append(f"{name}: amplitude {amplitude} %, phase {phase} rad{more}")
     rows = f"{low / timing.row_time:.3g} to {high / timing.row_time:.3g}"
-    effects = "; ".join(of_tones)
-    return [f"exposure_rows={timing.exposure_rows:g}: the blur agrees with {rows}: {effects}"] if of_tones else []
+    effects = "; ".join(tone_texts)
+    return [f"exposure_rows={timing.exposure_rows:g}: the blur agrees with {rows}: {effects}"] if tone_texts else []

@@ -1,4 +1,4 @@
-"""Spectrum of the displacement from the offsets of rows between frames: lines, and what remains without them.
+"""Spectrum of the displacement from the offsets of rows between frames: lines, and the residual without them.
 
 Rows are measured while a frame is read out, with gaps between the frames. A Fourier transform of such a record shows
 every line again at multiples of the frame rate beside it, as large as the gap is long. Lines are therefore fitted to
@@ -129,39 +129,39 @@ def displacement_spectrum(
 ) -> DisplacementSpectrum:
     """The spectrum of the displacement from offsets of one stack, ``fitted`` (P, N, A) by a known vibration."""
     check_single("result", curve.batch_shape)
-    good = curve.good & (curve.quality > 0)
+    mask = curve.good & (curve.quality > 0)
     if curve.std is not None:
-        good &= (torch.isfinite(curve.std) & (curve.std > 0)).all(-1)
-    if int(good.sum()) < 8:
-        raise ValueError(f"a spectrum needs at least 8 measured offsets, got {int(good.sum())}; use more frames")
-    measured = _measurements(curve, good, fitted, timing)
+        mask &= (torch.isfinite(curve.std) & (curve.std > 0)).all(-1)
+    if int(mask.sum()) < 8:
+        raise ValueError(f"a spectrum needs at least 8 measured offsets, got {int(mask.sum())}; use more frames")
+    measurements = _measurements(curve, mask, fitted, timing)
     # Rows of bands that overlap are averaged: above the rate of separate bands, their errors would be amplified.
     spacing = float(curve.rows.diff().median()) if len(curve.rows) > 1 else timing.frame_rows
     spacing = max(spacing, *curve.heights)
-    step = 0.5 / float(measured.span[0])
+    step = 0.5 / float(measurements.span[0])
     frequency = step * np.arange(2, max(math.floor(0.5 / (spacing * timing.row_time) / step), 8) + 1)
     spectra = [
-        _spectrum(measured.of_axis(axis), frequency, _lines_of(vibration, axis, measured.centre))
-        for axis in range(measured.displacements.shape[-1])
+        _spectrum(measurements.of_axis(axis), frequency, _lines_of(vibration, axis, measurements.centre))
+        for axis in range(measurements.displacements.shape[-1])
     ]
     amplitudes, noises, lines, responses = zip(*spectra, strict=True)
-    # a frequency is blind if it is for any axis
+    # a frequency that is blind on one axis counts as blind
     blind = np.any([response < _BLIND_GAIN * response.max() for response in responses], 0)
     return DisplacementSpectrum(
         tensor(frequency),
         tensor(np.where(blind, np.nan, np.stack(amplitudes))),
         tensor(np.where(blind, np.nan, np.stack(noises))),
         tensor(blind),
-        motion_of_fit(_fit_of_lines(lines, measured.centre))[0],
+        motion_of_fit(_fit_of_lines(lines, measurements.centre))[0],
         2 * step,
     )
 
 
-def _measurements(curve: OffsetCurve, good: Tensor, fitted: Tensor, timing: SensorTiming) -> Measurements:
-    """The good offsets of one stack, without those that are ``fitted``, weighted by their quality and variance."""
-    offsets, quality = table((curve.offsets - fitted)[good]), table(curve.quality[good])
-    std = np.ones_like(offsets) if curve.std is None else table(curve.std[good])
-    starts = np.stack([table(times[good]) for times in (curve.times, curve.later_times)], -1)
+def _measurements(curve: OffsetCurve, mask: Tensor, fitted: Tensor, timing: SensorTiming) -> Measurements:
+    """The offsets of one stack in a mask, less the ``fitted`` ones, weighted by their quality and variance."""
+    offsets, quality = table((curve.offsets - fitted)[mask]), table(curve.quality[mask])
+    std = np.ones_like(offsets) if curve.std is None else table(curve.std[mask])
+    starts = np.stack([table(times[mask]) for times in (curve.times, curve.later_times)], -1)
     weights = quality[:, None] / np.square(std)
     return Measurements(
         starts[None],
@@ -173,18 +173,17 @@ def _measurements(curve: OffsetCurve, good: Tensor, fitted: Tensor, timing: Sens
     )
 
 
-def _spectrum(measured: Measurements, frequency: Array, known: Array) -> tuple[Array, Array, Array, Array]:
+def _spectrum(measured: Measurements, frequency: Array, known_lines: Array) -> tuple[Array, Array, Array, Array]:
     """Amplitudes (F,), noise (F,), lines (L, 2) as frequency and complex amplitude, and the response (F,), of an axis.
 
-    ``frequency`` (F,) Hz has equal steps that begin at twice the step, and ``known`` (K, 2) are lines that the
-    displacements do not contain.
+    ``frequency`` (F,) Hz has equal steps and begins at twice the step. ``known_lines`` (K, 2) were already subtracted
+    from the displacements.
     """
     span, grid = float(measured.span[0]), (float(frequency[1] - frequency[0]), 2, len(frequency))
     times, weights = measured.middles[..., 0, 0], measured.weights[..., 0]  # (1, N, 2), (1, N)
     # Response of an offset to a displacement of each frequency, and its sum over the offsets.
     attenuation = np.sinc(frequency * measured.smearing_times[:, 0]).prod(0)[0]
-    intervals = fourier_sums(np.diff(times), weights[..., None], grid)[0]
-    energy = 2 * (weights.sum() - intervals.real)
+    energy = 2 * (weights.sum() - fourier_sums(np.diff(times), weights[..., None], grid)[0].real)
     energy = np.maximum(energy, 1e-12 * energy.max())
     response = np.abs(attenuation) * np.sqrt(energy)
     visible, shown = (response >= gain * response.max() for gain in (_BLIND_GAIN, _SEARCHED_GAIN))
@@ -199,26 +198,26 @@ def _spectrum(measured: Measurements, frequency: Array, known: Array) -> tuple[A
         excess = np.where(searched, power / max(level, 1e-300), 0.0)
         if excess.max() < threshold or fit.active.shape[-1] == _MAX_LINES:
             break
-        # The line that is most significant, then all lines together. A line beside another one, or at a frequency
-        # that the offsets do not show, is an error of the others.
+        # The most significant line is added, and all lines are fitted together. A line beside another one, or at a
+        # frequency that the offsets do not show, is an error of the other lines.
         peak = frequency[excess.argmax()]
-        trial, rest = _fitted(measured, np.append(fit.frequencies, peak))
-        at = np.sort(trial.frequencies[0, 0])
-        if (np.diff(at) < 0.25 / span).any() or not np.interp(at, frequency, shown.astype(float)).all():
+        trial, trial_residual = _fitted(measured, np.append(fit.frequencies, peak))
+        peaks = np.sort(trial.frequencies[0, 0])
+        if (np.diff(peaks) < 0.25 / span).any() or not np.interp(peaks, frequency, shown.astype(float)).all():
             searched = searched & (np.abs(frequency - peak) > 0.5 / span)
         else:
-            fit, residual = trial, rest
+            fit, residual = trial, trial_residual
     complex_amplitude = sums / (0.5 * np.where(visible, attenuation, np.inf) * energy)
-    lines = np.concatenate([known, np.stack([fit.frequencies[0, 0], fit.coefficients[0, 0]], -1)])
+    lines = np.concatenate([known_lines, np.stack([fit.frequencies[0, 0], fit.coefficients[0, 0]], -1)])
     # the width of a line is chosen so that the integral of its PSD is half of its squared amplitude
     places, sizes = (frequency - lines[:, :1].real) * span, lines[:, 1:]
     complex_amplitude = complex_amplitude + (sizes * np.exp(-0.5 * np.pi * np.square(places))).sum(0)
     noise = 2 * np.sqrt(level / energy) / np.maximum(np.abs(attenuation), 1e-12)
-    # Errors of the registration are lines of any size in a blind band: these must also be shown by the offsets.
+    # Errors of the registration are lines of any size in a blind band: the offsets must also show these.
     gain = np.interp(lines[:, 0].real, frequency, response / response.max())
     offset = np.abs(lines[:, 1]) * gain
     listed = (gain >= _BLIND_GAIN) | (offset >= SMALLEST_SHOWN * offset.max(initial=0.0))
-    listed[: len(known)] = True
+    listed[: len(known_lines)] = True
     return np.abs(complex_amplitude), noise, lines[listed], response
 
 
@@ -240,8 +239,8 @@ def _lines_of(vibration: Vibration, axis: int, centre: Array) -> Array:
 def _fit_of_lines(lines: tuple[Array, ...], centre: Array) -> ToneFit:
     """Lines of each axis as a fit, inverse of ``_lines_of``."""
     values = np.zeros((2, 1, len(lines), max(1, *map(len, lines))), complex)
-    for axis, of_axis in enumerate(lines):
-        values[:, 0, axis, : len(of_axis)] = of_axis.T
+    for axis, axis_lines in enumerate(lines):
+        values[:, 0, axis, : len(axis_lines)] = axis_lines.T
     frequencies, coefficients = values
     drift, covariance = np.zeros((1, len(lines), 1)), np.zeros((1, 0, 0))
     return ToneFit(coefficients, frequencies.real, coefficients != 0, drift, covariance, centre)

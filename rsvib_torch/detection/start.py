@@ -1,7 +1,7 @@
-"""The start of every detection: the offsets of row bands of grey frames, and the measurements these give.
+"""The start of every detection: the offsets of row bands of grey frames, as measurements for a fit.
 
 Roll and zoom displace the content of a row by amounts that depend on the column (``displacement_at``). For a start,
-strips of columns are registered like stacks of their own. With the displacement ``d_s`` of a row in strip s, its
+strips of columns are registered as separate stacks. With the displacement ``d_s`` of a row in strip s, its
 information ``W_s`` and the factors ``F_s`` from the components q of the motion to the displacement at the strip, the
 components of the row are the weighted least-squares solution
 
@@ -66,15 +66,14 @@ class FieldScale:
         return replace(fitted.scaled(self.units(fitted.amplitude)), camera=self.camera)
 
     def free_motion(self, fitted: FreeMotion) -> FreeMotion:
-        """The same for a free motion."""
+        """``motion`` for a free motion."""
         coefficients = fitted.coefficients * self.units(fitted.coefficients)[:, None]
         return FreeMotion(coefficients, fitted.start, fitted.spacing, self.motion(fitted.tones))
 
     def std(self, fitted: VibrationStd) -> VibrationStd:
-        """The same for standard deviations."""
+        """``motion`` for standard deviations."""
         factor = self.units(fitted.amplitude)
-        of_axes = ("image_motion", "image_acceleration", "displacement")
-        values = {name: getattr(fitted, name) for name in of_axes}
+        values = {name: getattr(fitted, name) for name in ("image_motion", "image_acceleration", "displacement")}
         scaled = {name: value * factor for name, value in values.items() if value is not None}
         return replace(fitted, amplitude=fitted.amplitude * factor[:, None], **scaled)
 
@@ -115,16 +114,16 @@ def combined_strips(measured: Measurements, factors: Array) -> Measurements:
     # 2. The normal equations of the components of every row, in units of their sizes.
     weighted = of_strips(measured.information) @ factors
     information = (factors.mT @ weighted).sum(1)  # (B, N, A, A)
-    right = np.einsum("bsnia,bsngi->bnga", weighted, displacements)
+    right_side = np.einsum("bsnia,bsngi->bnga", weighted, displacements)
     size = information.diagonal(axis1=-2, axis2=-1)
     unit = 1 / np.sqrt(np.maximum(size, 1e-300))
     normal = information * unit[..., :, None] * unit[..., None, :]
     # 3. Their solution; fewer than two strips with detail do not determine roll.
     values, vectors = np.linalg.eigh(np.where((size > 0).all(-1)[..., None, None], normal, 0.0))
     regular = values[..., 0] > 1e-6
-    solvable = np.where(regular[..., None], values, 1.0)
-    inverse = (vectors / solvable[..., None, :]) @ vectors.mT  # (B, N, A, A)
-    components = np.where(regular[:, :, None, None], ((right * unit[:, :, None]) @ inverse) * unit[:, :, None], 0.0)
+    inverse = (vectors / np.where(regular[..., None], values, 1.0)[..., None, :]) @ vectors.mT  # (B, N, A, A)
+    unit = unit[:, :, None]
+    components = np.where(regular[:, :, None, None], ((right_side * unit) @ inverse) * unit, 0.0)
     return Measurements(
         of_strips(measured.exposure_starts).mean(1),
         components,
@@ -144,8 +143,8 @@ def band_curve(
 ) -> OffsetCurve:
     """Offsets of the row bands of grey frames (B, T, H, W), NaN for bands with more than half of their pixels missing.
 
-    A ``mere_start`` is only the start of a fit to rows. Of wide frames, the 320 columns with the most detail are used
-    then, unless a fifth of their bands cannot be registered.
+    A ``mere_start`` is only the start of a fit to rows: only the 320 columns of wide frames with the most detail are
+    used, unless a fifth of their bands cannot be registered.
     """
     check_frame_size(frames.shape[-2], frames.shape[-1], options)  # of the user's frames, not of the columns in use
     curve = None
@@ -171,8 +170,8 @@ class BandStart:
     """Offsets of row bands, with which every detection starts."""
 
     curve: OffsetCurve  # (B, P, N) offsets; with roll and zoom in px (``FieldScale``)
-    measurements: Measurements  # the same as input of a fit
-    fit: ToneFit | None = None  # tones that are known; None if there are none
+    measurements: Measurements  # the offsets as input of a fit
+    fit: ToneFit | None = None  # fit of tones that are known; None if there are none
 
     def predicted(self, fit: ToneFit) -> Array:
         """Offsets (B, P, N, A) in px of the row bands that a fit predicts."""
@@ -207,21 +206,21 @@ def field_start(
     frames, valid, width = stacks.images, stacks.valid, stacks.images.shape[-1]
     count = _num_strips(width)
     check_frame_size(frames.shape[-2], width, options, count)
-    part = round(width / count)  # px
-    firsts = tuple(round(number * (width - part) / (count - 1)) for number in range(count))
-    strips = ColumnStrips(width, part, firsts, tuple(first + 0.5 * (part - 1) for first in firsts))
+    size = round(width / count)  # px
+    firsts = tuple(round(number * (width - size) / (count - 1)) for number in range(count))
+    strips = ColumnStrips(width, size, firsts, tuple(first + 0.5 * (size - 1) for first in firsts))
     cut_valid = None if valid is None else strips.cut(valid)
-    of_strips = band_curve(strips.cut(frames), cut_valid, timing, options, mere_start=False)
+    strip_curve = band_curve(strips.cut(frames), cut_valid, timing, options, mere_start=False)
     columns = strips.columns.to(frames.device)
-    rows = (of_strips.rows - 0.5 * (scale.height - 1)).repeat(len(of_strips.pairs))
+    rows = (strip_curve.rows - 0.5 * (scale.height - 1)).repeat(len(strip_curve.pairs))
     factors = scale.factors(columns[:, None].expand(-1, len(rows)), rows.expand(count, -1))
-    of_parts = measurements_of_curve(of_strips, timing, options.band_step)
-    measurements = combined_strips(of_parts, np.repeat(table(factors)[None], len(frames), 0))
-    good = np.all(measurements.weights > 0, -1)[..., None]
-    offsets = np.where(good, measurements.displacements[:, :, 1] - measurements.displacements[:, :, 0], np.nan)
-    offsets, good = (split_axis(values, 1, *of_strips.quality.shape[1:]) for values in (offsets, good))
-    quality = of_strips.quality.unflatten(0, (-1, count)).amin(1) * torch.from_numpy(good[..., 0]).to(frames.device)
-    curve = replace(of_strips, offsets=torch.from_numpy(offsets).to(frames.device), quality=quality)
+    strip_measurements = measurements_of_curve(strip_curve, timing, options.band_step)
+    measurements = combined_strips(strip_measurements, np.repeat(table(factors)[None], len(frames), 0))
+    mask = np.all(measurements.weights > 0, -1)[..., None]
+    offsets = np.where(mask, measurements.displacements[:, :, 1] - measurements.displacements[:, :, 0], np.nan)
+    offsets, mask = (split_axis(values, 1, *strip_curve.quality.shape[1:]) for values in (offsets, mask))
+    quality = strip_curve.quality.unflatten(0, (-1, count)).amin(1) * torch.from_numpy(mask[..., 0]).to(frames.device)
+    curve = replace(strip_curve, offsets=torch.from_numpy(offsets).to(frames.device), quality=quality)
     return BandStart(curve, measurements, None if translation is None else with_axes(translation, scale.axes))
 
 
@@ -234,17 +233,17 @@ def measurements_of_curve(curve: OffsetCurve, timing: RowTiming, band_step: int)
     # 1. The offsets and the weights of the bands of all frame pairs.
     offsets, quality, times, later_times = tables(curve.offsets, curve.quality, curve.times, curve.later_times)
     offsets = offsets.reshape(len(offsets), -1, offsets.shape[-1])
-    good = np.all(np.isfinite(offsets), -1)
-    noise = 1.0 - np.minimum(quality.reshape(good.shape), 1.0)
-    weight = np.where(good, 1.0 / (noise + 0.05), 0.0)
-    weight = weight / np.maximum(weight.sum(1, keepdims=True) / np.maximum(good.sum(1, keepdims=True), 1), 1e-300)
-    offsets = np.where(good[..., None], offsets, 0.0)
+    measured = np.all(np.isfinite(offsets), -1)
+    noise = 1.0 - np.minimum(quality.reshape(measured.shape), 1.0)
+    weight = np.where(measured, 1.0 / (noise + 0.05), 0.0)
+    weight = weight / np.maximum(weight.sum(1, keepdims=True) / np.maximum(measured.sum(1, keepdims=True), 1), 1e-300)
+    offsets = np.where(measured[..., None], offsets, 0.0)
     # 2. Their times: content that moves by y along the scan axis is exposed y row times later in the later frame.
-    starts = np.broadcast_to(times.ravel(), good.shape), later_times.ravel() + offsets[..., 1] * timing.row_time
+    starts = np.broadcast_to(times.ravel(), measured.shape), later_times.ravel() + offsets[..., 1] * timing.row_time
     return Measurements(
         np.stack(starts, -1),
         np.stack([-0.5 * offsets, 0.5 * offsets], -2),
-        visible=np.ones((*good.shape, 2)),
+        visible=np.ones((*measured.shape, 2)),
         information=2.0 * weight[..., None, None] * np.eye(2),  # of each of the two, equal and opposite
         exposure_time=timing.exposure_time,
         average_times=(curve.heights[0] * timing.row_time, curve.heights[1] * timing.row_time),

@@ -48,13 +48,13 @@ def judged(
 ) -> tuple[Findings, ...]:
     """Reasons against the vibrations of B stacks, for each of their A axes in row order.
 
-    ``measured`` is the motion of the rows that they do not explain, or ``compared_bands``. ``intervals`` in s are
-    those between the frames of the largest groups. ``displacement`` and ``known_std`` (B, A) in px are the displacement
-    of the rows by the tones without its mean, rms over the rows, and its standard deviation if the number of tones is
-    right. An axis with ``max_tones``, the largest number that was tried, may have more. ``radius`` is the distance from
-    the centre, in px, at which roll and zoom are displacements in px.
+    ``measured`` is the motion of the rows that they do not explain, or ``compared_bands``. ``intervals`` are the times
+    in s between the frames of the largest groups. ``displacement`` (B, A) in px is the displacement of the rows by the
+    tones without its mean, rms over the rows, and ``known_std`` its standard deviation if the number of tones is right.
+    An axis with ``max_tones``, the largest number that was tried, may have more. ``radius`` is the distance in px from
+    the centre, at which roll and zoom are displacements in px.
     """
-    # 1. The compared quantities of all stacks and axes.
+    # 1. The quantities of all stacks and axes that are compared with limits.
     frequency = table(vibration.frequency)
     quantities = {
         "amplitude": table(vibration.amplitude),
@@ -82,8 +82,8 @@ def judged(
         # A displacement by roll or zoom depends on the distance from the centre.
         for reasons in against[2:]:
             reasons[:] = [
-                replace(one, details={**one.details, "radius": radius}) if one.kind.unit == "px" else one
-                for one in reasons
+                replace(reason, details={**reason.details, "radius": radius}) if reason.kind.unit == "px" else reason
+                for reason in reasons
             ]
         findings.append(tuple(map(tuple, against)))
     return tuple(findings)
@@ -92,18 +92,18 @@ def judged(
 def compared_bands(offsets: Array, fitted: Array, visible: Array) -> dict[str, Array]:
     """Fraction of the visible bands that were registered, and size and residual of the best three quarters of them.
 
-    Offsets (B, M, A) in px are NaN where a band could not be registered; the vibration predicts those that are
-    ``fitted``, and both frames contain the ``visible`` (B, M) bands.
+    Offsets (B, M, A) in px are NaN where a band could not be registered. The vibration predicts the offsets ``fitted``.
+    ``visible`` (B, M) is true for bands that both frames contain.
     """
-    good = np.isfinite(offsets).all(-1) & visible
-    number = good.sum(1, keepdims=True)
-    offsets = np.where(good[..., None], offsets, np.nan)
+    registered = np.isfinite(offsets).all(-1) & visible
+    num_registered = registered.sum(1, keepdims=True)
+    offsets = np.where(registered[..., None], offsets, np.nan)
     # Clouds may cover the other quarter.
     residuals = np.sort(without_nan(np.abs(offsets - fitted), math.inf), 1)
-    counted = np.ceil(0.75 * number)
+    counted = np.ceil(0.75 * num_registered)
     best = np.arange(residuals.shape[1])[:, None] < counted[:, None]
     return {
-        "measured": number[:, 0] / np.maximum(visible.sum(1), 1),
+        "measured": num_registered[:, 0] / np.maximum(visible.sum(1), 1),
         "bands": visible.sum(1),
         "residual": np.where(best, residuals, 0.0).sum(1) / counted,
         "size": valid_mean(np.abs(offsets - valid_mean(offsets, 1)[:, None]), 1),
@@ -113,17 +113,17 @@ def compared_bands(offsets: Array, fitted: Array, visible: Array) -> dict[str, A
 def _reasons_against_stack(stack: Table, timing: RowTiming, max_tones: float, intervals: int) -> list[list[Reason]]:
     """Reasons against each axis of one stack, from its compared quantities and the number of intervals of frames."""
     least_gain = _MIN_GAIN_OF_TWO if intervals == 1 else MIN_GAIN
-    by_rows, axes, of_all = "bands" not in stack, len(stack["amplitude"]), []
+    by_rows, axes, common_reasons = "bands" not in stack, len(stack["amplitude"]), []
     if stack["measured"] < _MIN_MEASURED:
-        what = "the rows that frames have in common" if by_rows else f"{stack['bands']:g} row bands"
-        of_all = [Reason("rows_not_registered", None, stack["measured"], _MIN_MEASURED, {"what": what})]
+        details = {"what": "the rows that frames have in common" if by_rows else f"{stack['bands']:g} row bands"}
+        common_reasons = [Reason("rows_not_registered", None, stack["measured"], _MIN_MEASURED, details)]
     if by_rows:
-        of_all += exposure_reasons(timing, *stack["blur"])
+        common_reasons += exposure_reasons(timing, *stack["blur"])
     against, aliases = [], list[Reason]()
     for axis, name in enumerate(AXIS_NAMES[:axes]):
         numbers = {quantity: values[axis] for quantity, values in stack.items() if quantity not in _OF_STACK}
         tones = [tone for tone, amplitude in enumerate(numbers["amplitude"]) if amplitude > 0]
-        reasons = of_all.copy()
+        reasons = common_reasons.copy()
         if not tones:
             reasons.append(Reason("no_tone", name))
         if len(tones) >= max_tones:
@@ -144,29 +144,28 @@ def _reasons_against_stack(stack: Table, timing: RowTiming, max_tones: float, in
     return [[*aliases, *reasons] for reasons in against]
 
 
-def scene_reasons(curve: OffsetCurve, columns: int, *, of_pairs: bool = False) -> list[list[Reason]]:
+def scene_reasons(curve: OffsetCurve, columns: int, *, by_pair: bool = False) -> list[list[Reason]]:
     """For each stack, the reason against frames that show different scenes or noise; ``columns`` is their width in px.
 
     Without it, 6 of 24 stacks of 2 to 8 frames of independent noise had reliable axes, with amplitudes of 5 to 52 px;
-    and a motion beyond the search range, of which a sixth of the bands was registered, had a wrong one. ``of_pairs``
+    and a motion beyond the search range, of which a sixth of the bands was registered, had a wrong one. ``by_pair``
     compares the pair of frames with the fewest similar bands instead of all together: a free motion, other than tones,
     follows one frame of noise.
     """
     registered, similar = curve.good.double().mean((1, 2)), similar_share(curve, columns)
-    of_stacks = similar.amin(-1) if of_pairs else similar.mean(-1)
-    against, what = list[list[Reason]](), {"what": "the row bands of two frames" if of_pairs else "the row bands"}
-    for share_similar, share_registered in zip(of_stacks.tolist(), registered.tolist(), strict=True):
-        too_few = share_registered < _MIN_REGISTERED
-        share, limit = (share_registered, _MIN_REGISTERED) if too_few else (share_similar, _MIN_MEASURED)
-        against.append([Reason("rows_not_registered", None, share, limit, what)] if share < limit else [])
+    similar = similar.amin(-1) if by_pair else similar.mean(-1)
+    against, details = list[list[Reason]](), {"what": "the row bands of two frames" if by_pair else "the row bands"}
+    for shares in zip(registered.tolist(), similar.tolist(), strict=True):
+        share, limit = (shares[0], _MIN_REGISTERED) if shares[0] < _MIN_REGISTERED else (shares[1], _MIN_MEASURED)
+        against.append([Reason("rows_not_registered", None, share, limit, details)] if share < limit else [])
     return against
 
 
-def with_reasons_of_all(of_all: list[Reason], findings: Findings) -> Findings:
-    """The findings of a stack with further reasons against each axis, unless the axis has one with the same code."""
+def with_common_reasons(common_reasons: list[Reason], findings: Findings) -> Findings:
+    """The findings of a stack with reasons against all axes, each added unless the axis has one with the same code."""
     return tuple(
-        (*(reason for reason in of_all if all(one.code != reason.code for one in of_axis)), *of_axis)
-        for of_axis in findings
+        (*(common for common in common_reasons if common.code not in {reason.code for reason in reasons}), *reasons)
+        for reasons in findings
     )
 
 
@@ -271,27 +270,28 @@ def with_remedy(reasons: Iterable[Reason], remedy: str) -> tuple[Reason, ...]:
     """Reasons with another remedy where theirs is to follow a vibration that changes, or to try other tones."""
     codes = {"displacement_ambiguous", "rows_unexplained", "neighbours_unexplained"}
     return tuple(
-        replace(one, details={**one.details, "instead": remedy}) if one.code in codes else one for one in reasons
+        replace(reason, details={**reason.details, "instead": remedy}) if reason.code in codes else reason
+        for reason in reasons
     )
 
 
 def contradicted_axes(findings: Findings) -> list[bool]:
     """Whether the measured rows contradict the tones of x and y, so that another timing may be the cause."""
     codes = {"too_many_tones", "rows_unexplained", "neighbours_unexplained", "displacement_ambiguous"}
-    return [any(reason.code in codes for reason in of_axis) for of_axis in findings[:2]]
+    return [any(reason.code in codes for reason in reasons) for reasons in findings[:2]]
 
 
 # Roll and zoom
 
 
-def _max_apart(size: Array | float) -> Array:
+def _max_difference(size: Array | float) -> Array:
     """Largest permitted difference in px of the displacements along a row, for an axis with offsets of size px rms."""
     return np.maximum(0.009 * size, 0.035)
 
 
-def halves_move_apart(other: OtherMotion) -> Array:
+def halves_move_apart(other_motion: OtherMotion) -> Array:
     """(B,) whether the halves of the rows move apart, as roll and zoom cause it."""
-    return np.any(other.differential[..., ::-1] > _max_apart(other.size), -1)
+    return np.any(other_motion.differential[..., ::-1] > _max_difference(other_motion.size), -1)
 
 
 # Limits of roll and zoom as the cause. Clouds, parallax and objects had 0.12 px and more of the differences along a row
@@ -308,17 +308,17 @@ _MAX_TWO_MOTIONS = 4.0
 _MAX_UNEVEN_PART = 0.5
 
 
-def rotation_possible(other: OtherMotion, uneven: Array, aspect: float) -> Array:
-    """(B,) whether roll or zoom may be all that the fit of a stack does not explain.
+def rotation_possible(other_motion: OtherMotion, uneven: Array, aspect: float) -> Array:
+    """(B,) whether roll or zoom may explain the whole residual of the fit of a stack.
 
     ``uneven`` (B, 2) px are differences of the displacements along a row that are not linear in the column; ``aspect``
     is the rows of a frame over its columns.
     """
-    differential = other.differential[..., ::-1]
-    even = np.maximum(_MAX_UNEVEN * _max_apart(other.size), _MAX_UNEVEN_PART * differential)
-    is_uneven = (uneven[..., ::-1] > even).any(-1)
-    limit = np.maximum(other.permitted, _MAX_MOVED * max(1.0, aspect) * differential.max(-1, keepdims=True))
-    return halves_move_apart(other) & ~is_uneven & ~(other.unexplained > limit).any(-1)
+    difference = other_motion.differential[..., ::-1]
+    max_uneven = np.maximum(_MAX_UNEVEN * _max_difference(other_motion.size), _MAX_UNEVEN_PART * difference)
+    is_uneven = (uneven[..., ::-1] > max_uneven).any(-1)
+    limit = np.maximum(other_motion.permitted, _MAX_MOVED * max(1.0, aspect) * difference.max(-1, keepdims=True))
+    return halves_move_apart(other_motion) & ~is_uneven & ~(other_motion.unexplained > limit).any(-1)
 
 
 def rotation_reasons(axis: int, axes: int, differential: Sequence[float], size: float) -> list[Reason]:
@@ -326,20 +326,20 @@ def rotation_reasons(axis: int, axes: int, differential: Sequence[float], size: 
 
     A roll by theta moves the halves of a row by ``theta W / 4`` along y in opposite directions, and rows by up to
     ``theta H / 2`` along x. A zoom does the same with the axes exchanged. Halves that move apart along the axis itself
-    by more show two motions, so that their mean is that of neither.
+    by more show two motions, and their mean is neither of them.
 
     ``differential`` (2,) px is the rms difference of the displacements along a row that the motion does not explain,
     and ``size`` px the rms offset along the axis.
     """
-    allowed = float(_max_apart(size))
+    allowed = float(_max_difference(size))
     if axes > 2:
-        rms = max(differential)
+        difference = max(differential)
     elif differential[axis] > _MAX_TWO_MOTIONS * allowed:
-        rms = differential[axis]
+        difference = differential[axis]
     else:
-        rms = differential[1 - axis]
+        difference = differential[1 - axis]
     code = "strips_apart" if axes > 2 else "halves_apart"
-    return [Reason(code, AXIS_NAMES[axis], rms, allowed)] if rms > allowed else []  # not if it is NaN
+    return [Reason(code, AXIS_NAMES[axis], difference, allowed)] if difference > allowed else []  # not if it is NaN
 
 
 # Exposure
@@ -365,9 +365,9 @@ def exposure_reasons(timing: RowTiming, ratio: float, std: float, size: float | 
     if not (is_low or is_high):
         return []
     details: dict[str, float | str] = {"exposure_rows": timing.exposure_rows}
-    likely = timing.exposure_rows * math.sqrt(max(ratio, 0.0))
-    if 0 < likely * timing.row_time <= timing.frame_period:  # longer ones are no exposures; another error is the cause
-        details |= {"likely": likely} if size is not None else {"likely_ms": 1e3 * likely * timing.row_time}
+    rows = timing.exposure_rows * math.sqrt(max(ratio, 0.0))
+    if 0 < rows * timing.row_time <= timing.frame_period:  # longer exposures are impossible; the cause is another error
+        details |= {"likely": rows} if size is not None else {"likely_ms": 1e3 * rows * timing.row_time}
     if size is None:
         details["exposure_ms"] = 1e3 * timing.exposure_time
     if is_low:
@@ -378,15 +378,15 @@ def exposure_reasons(timing: RowTiming, ratio: float, std: float, size: float | 
 # Recorded motions
 
 
-def recording_reasons(motion: Sequence[float], unexplained: Sequence[float], other: float | None) -> list[Reason]:
-    """Reasons against a recorded motion, from rms motion in px by it and beside it, and another clock offset in s."""
-    reasons, largest = [], max(motion)
-    if largest < _MIN_MOTION:
-        reasons.append(Reason("recorded_motion_too_small", None, largest, _MIN_MOTION))
-    for name, size, residual in zip(AXIS_NAMES, motion, unexplained, strict=False):
+def recording_reasons(sizes: Sequence[float], residuals: Sequence[float], other_offset: float | None) -> list[Reason]:
+    """Reasons against a recorded motion, from its rms displacements and residuals in px, and another offset in s."""
+    reasons = []
+    if max(sizes) < _MIN_MOTION:
+        reasons.append(Reason("recorded_motion_too_small", None, max(sizes), _MIN_MOTION))
+    for name, size, residual in zip(AXIS_NAMES, sizes, residuals, strict=False):
         allowed = max(0.25 * size, 0.05)  # px
         if residual > allowed:
             reasons.append(Reason("recording_incomplete", name, residual, allowed))
-    if other is not None:
-        reasons.append(Reason("motion_repeats", details={"offset": other}))
+    if other_offset is not None:
+        reasons.append(Reason("motion_repeats", details={"offset": other_offset}))
     return reasons

@@ -1,4 +1,4 @@
-"""Threads, chunks and items made ahead; decorators that exclude functions from mixed precision, graphs, gradients."""
+"""Threads, chunks, items computed ahead; decorators that exclude functions from mixed precision, graphs, gradients."""
 
 import sys
 from collections import deque
@@ -27,9 +27,9 @@ def runs(count: int, size: int) -> list[slice]:
 
 
 def at_once(bytes_per_item: int, device: torch.device, *, cpu_bytes: int = 2**23) -> int:
-    """Number of items to process at a time: those of ``cpu_bytes``, which stay in the cache of a CPU.
+    """Number of items to process at a time: at least 1, and as many as ``cpu_bytes`` hold, the cache of a CPU.
 
-    On other devices those of 1 GiB, which limits the memory. At least 1.
+    On other devices, as many as 1 GiB holds, which limits the memory.
     """
     return max(1, (cpu_bytes if device.type == "cpu" else 2**30) // bytes_per_item)
 
@@ -133,11 +133,11 @@ def in_parallel(
         # a new pool each time, because a kept one would not survive a fork; this thread takes part, because the C
         # library keeps the memory that it frees for the next call, but may return that of other threads
         with ThreadPoolExecutor(threads - 1) as pool:
-            others = [pool.submit(take_part) for _ in range(threads - 1)]
-            made = take_part()
+            futures = [pool.submit(take_part) for _ in range(threads - 1)]
+            own_results = take_part()
     finally:
         torch.set_num_threads(within)  # the initial value of threads that are started later
-    results = dict(chain(made, *(other.result() for other in others)))
+    results = dict(chain(own_results, *(future.result() for future in futures)))
     return [results[place] for place in range(len(items))]
 
 
@@ -155,15 +155,15 @@ def _pool(count: int, threads: int, items: Generator[object, None, None]) -> Ite
 
 
 def prefetched(items: Generator[Item, None, None], count: int, threads: int = 1) -> Generator[Item, None, None]:
-    """Yield the items of a generator, which a thread makes while earlier ones are used; ``count`` of them wait.
+    """Yield the items of a generator, which a thread computes while earlier ones are used; up to ``count`` wait.
 
-    The thread uses a number of ``threads`` of PyTorch. It ends with the generator, or when this one is closed. Errors
-    are raised behind the items before them.
+    The thread uses a number of ``threads`` of PyTorch. It ends with the generator, or when this one is closed. An error
+    is raised after the items before it.
     """
     with _pool(1, threads, items) as pool:
         waiting = deque(pool.submit(list, islice(items, 1)) for _ in range(count + 1))
-        while made := waiting.popleft().result():  # empty if there are no further items
-            yield made[0]
+        while item := waiting.popleft().result():  # empty if there are no further items
+            yield item[0]
             waiting.append(pool.submit(list, islice(items, 1)))
 
 

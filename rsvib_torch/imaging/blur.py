@@ -164,8 +164,8 @@ def form_frames(
     for part in runs(source.shape[1], at_once(16 * taps.shape[-2] * len(u) * len(source), along.device)):
         transfer = row_transfer(taps[:, part], along[:, part], u).to(spectra.dtype)
         # sum over the taps of each row
-        of_rows = (spectra.flatten(-3, -2)[..., source[:, part], :] * transfer).sum(-2)
-        formed.append(torch.fft.irfft(of_rows, n=length)[..., columns])
+        row_spectra = (spectra.flatten(-3, -2)[..., source[:, part], :] * transfer).sum(-2)
+        formed.append(torch.fft.irfft(row_spectra, n=length)[..., columns])
     return torch.cat(formed, dim=-2)
 
 
@@ -207,8 +207,7 @@ def blur_rows(scene: Tensor, psf: RowPSF) -> Tensor:
         index = _gather_index(psf, tap, size)
         pixels = flat.gather(-1, index.flatten(-2).expand(*lead, -1)).unflatten(-1, index.shape[-2:])
         for column in range(kernel_width):
-            part = pixels.narrow(-1, kernel_width - 1 - column, size[1])
-            frames = frames + weights[..., tap, column, None] * part
+            frames = frames + weights[..., tap, column, None] * pixels.narrow(-1, kernel_width - 1 - column, size[1])
     return frames
 
 
@@ -231,7 +230,7 @@ def blur_rows_adjoint(frames: Tensor, psf: RowPSF, scene_shape: tuple[int, ...])
     check_broadcast(frames=frames[..., 0, 0], psf=weights[..., 0, 0, 0])
     lead = torch.broadcast_shapes(frames.shape[:-2], weights.shape[:-3])
     summed = zip(reversed(scene_shape[:-2]), reversed(lead), strict=False)
-    if len(scene_shape) - 2 > len(lead) or any(one not in (1, many) for one, many in summed):
+    if len(scene_shape) - 2 > len(lead) or any(length not in (1, many) for length, many in summed):
         raise ValueError(f"scene_shape {tuple(scene_shape)} does not broadcast to the frames {(*lead, *size)}")
     flat = frames.new_zeros(*lead, math.prod(size))
     num_rows, kernel_height, kernel_width = weights.shape[-3:]

@@ -40,7 +40,7 @@ class Optics(OpticsOptions):
     def transfer(self, u: Tensor, v: Tensor) -> Tensor:
         """Transfer function at horizontal and vertical frequencies in cycles/px, in their broadcast shape."""
         check_broadcast(u=u, v=v)
-        u, v = (given if given.dtype.is_floating_point else given.double() for given in (u, v))
+        u, v = (frequency if frequency.dtype.is_floating_point else frequency.double() for frequency in (u, v))
         squared = u.square() + v.square()
         transfer = torch.exp(-2 * (math.pi * self.sigma) ** 2 * squared)
         if self.cutoff is not None:

@@ -99,15 +99,15 @@ def simulate_frames(
     scene = frames_to_row_order(scene, timing)
     timing_in_rows = timing.in_row_order()
 
-    first = timing_in_rows.frame_starts(num_frames)
-    last = float(first[-1]) + timing.frame_period + timing.exposure_time
+    frame_starts = timing_in_rows.frame_starts(num_frames)
+    end = float(frame_starts[-1]) + timing.frame_period + timing.exposure_time
     reach = largest_in_frame(
-        motion.largest_displacement(float(first[0]), last), scene.shape[-1], scene.shape[-2], motion.camera
+        motion.largest_displacement(float(frame_starts[0]), end), scene.shape[-1], scene.shape[-2], motion.camera
     ).tolist()
     margins = tuple(_MARGIN + math.ceil(r) for r in reversed(reach))
     available = tuple(size - 2 * margin for size, margin in zip(scene.shape[-2:], margins, strict=True))
     size = (min(available[0], int(timing.frame_rows)), available[1]) if frame_size is None else frame_size
-    if min(size) < 1 or any(wanted > free for wanted, free in zip(size, available, strict=True)):
+    if min(size) < 1 or any(requested > free for requested, free in zip(size, available, strict=True)):
         needed = tuple(max(s, 1) + 2 * m for s, m in zip(size, margins, strict=True))
         raise ValueError(
             f"scene of {tuple(scene.shape[-2:])} (rows, columns in read order) is too small: a frame of {tuple(size)} "
@@ -134,10 +134,10 @@ def _form_frames(scene: Tensor, starts: Tensor, timing: RowTiming, motion: Motio
     slope = float(largest_slope(reached, width, starts.shape[-1], motion.camera))
     strips = ColumnStrips.of(width, max_pitch=min(max(_SLIDE / max(slope, 1e-9), 4.0), 16.0), margin=0)
     beyond = 2 * ((scene.shape[-1] - width) // 2)  # columns of the scene beside the frame
-    of_strips = ColumnMotion.of_columns(motion.expanded(1), strips.columns, timing, *starts.shape)
+    motions = ColumnMotion.of_columns(motion.expanded(1), strips.columns, timing, *starts.shape)
     formed = [
-        _form_rows(scene[..., first : first + strips.width + beyond], starts, timing, of_strip, strips.width)
-        for first, of_strip in zip(strips.firsts, (of_strips[i] for i in range(len(strips.firsts))), strict=True)
+        _form_rows(scene[..., first : first + strips.width + beyond], starts, timing, motions[number], strips.width)
+        for number, first in enumerate(strips.firsts)
     ]
     return strips.joined(torch.stack(formed))[0]
 

@@ -75,29 +75,28 @@ def rows_showing(
 
     They are the solution of ``r = s + Y(t(r))``.
     Row r is exposed from ``frame_start + r T_row`` on, and Y is the mean displacement over that exposure (Eq. 2).
-    Newton's method with shorter steps where a step increases the error; ``|dY/dt| T_row`` is 0.02 for 5 px at 30 Hz,
-    and must stay below 1: content that moves along the scan as fast as the rows is never passed. The vibration is in
+    Newton's method solves it, with shorter steps where one increases the error; ``|dY/dt| T_row`` is 0.02 for 5 px at
+    30 Hz, and must stay below 1: rows do not pass content that moves along the scan as fast. The vibration is in
     row order, its batch dimensions lead; ``frame_start`` in s broadcasts to S, and other exposures in s than that of
     the sensor to (S, 1).
     """
     check_two_axes(vibration, "the displacement of a row")
     rows = scene_rows = scene_rows.to(torch.float64)
-    near = torch.tensor([-1e-3, 0.0, 1e-3], dtype=torch.float64, device=rows.device)  # rows, for the derivative
-    first = frame_start[..., None] + near * timing.row_time
+    nearby = torch.tensor([-1e-3, 0.0, 1e-3], dtype=torch.float64, device=rows.device)  # rows, for the derivative
+    first = frame_start[..., None] + nearby * timing.row_time
     exposure = timing.exposure_time if exposure_time is None else exposure_time
-    step = least = last = torch.zeros_like(frame_start)
+    step = least = last_step = torch.zeros_like(frame_start)
     largest = 0.0  # px, step of Newton's method
-    for number in range(
-        16
-    ):  # of 71 motions with |dY/dt| T_row of 0.5 to 0.9, all need 11 at most; without halves 11 fail
+    # of 71 motions with |dY/dt| T_row of 0.5 to 0.9, all need at most 11 steps; without halves, 11 fail
+    for number in range(16):
         # 1. The error at the rows, and its derivative; the limit keeps steps finite near 0.
         rows = rows + step
-        of_rows = vibration.mean_displacement(torch.add(first, rows[..., None], alpha=timing.row_time), exposure)
-        below, displacement, above = of_rows.unbind(-2)
+        displacements = vibration.mean_displacement(torch.add(first, rows[..., None], alpha=timing.row_time), exposure)
+        below, displacement, above = displacements.unbind(-2)
         slope = (above - below) / 2e-3
         error = scene_rows + displacement[..., 1] - rows
         newton = error / (1.0 - slope[..., 1].detach()).clamp(min=0.1)
-        # 2. Each step is the square of the last one times the same number: end if the next one would be below 1e-6 px.
+        # 2. Each step is the square of the last one times a constant: end if the next one would be below 1e-6 px.
         size, change = error.detach().abs(), newton.detach()
         before, largest = largest, float(change.abs().max())
         if largest**3 <= 1e-6 * (before**2 + 1e-12):
@@ -105,10 +104,10 @@ def rows_showing(
         # 3. Newton's step; half of the last step back, where that step has increased the error.
         step = newton
         if number > 0:
-            worse, half = size > least, 0.5 * last
+            worse, half = size > least, 0.5 * last_step
             size, step = torch.where(worse, least, size), torch.where(worse, -half, newton)
             change = torch.where(worse, half, change)
-        least, last = size, change  # |error| before the step, and the step
+        least, last_step = size, change  # |error| before the step, and the step
     return rows + newton, displacement + slope * newton[..., None]
 
 
@@ -127,7 +126,7 @@ _ROUNDS = 60  # at most; 5 suffice for 5 px at 100 Hz and 20 us per row
 def recorded_offsets(
     motion: Motion, timing: SensorTiming, size: tuple[int, int], frame: int = 0, shift: Tensor | None = None
 ) -> tuple[Array, Array]:
-    """How far (x, y) from each pixel of the restored frame it was recorded, (2, n, m) px, and weights (m, length).
+    """Offsets (2, n, m) px (x, y) from pixels of the restored frame to their recorded places, and weights (m, length).
 
     Content that is at rest at s - shift was recorded at ``q = s - shift + D(s - shift, t(q))`` with the mean
     displacement D during the exposure of the row of q. Rows in the order of the sensor are n. Along them, the offsets
@@ -149,27 +148,27 @@ def recorded_offsets(
     knots = motion.spacing / timing.row_time if isinstance(motion, FreeMotion) else math.inf  # rows
     step = min(0.5, _PERIOD_STEP / max(fastest, 1e-12), _KNOT_STEP * knots)
     grid = np.arange(-0.5 * count - _BESIDE, 1.5 * count + _BESIDE, step)
-    of_grid = motion.mean_displacement(torch.from_numpy(start + grid * timing.row_time), timing.exposure_time)
-    of_rows = CubicSpline(grid, of_grid.detach().cpu().numpy())
+    grid_displacement = motion.mean_displacement(torch.from_numpy(start + grid * timing.row_time), timing.exposure_time)
+    spline = CubicSpline(grid, grid_displacement.detach().cpu().numpy())
     places = still
     for _ in range(_ROUNDS):  # the row of a place determines when it was recorded
         rows = places[along] if timing.readout_direction == "forward" else count - 1 - places[along]
-        displacement = torch.from_numpy(of_rows(rows.clamp(grid[0], grid[-1])))
-        before, places = places, still + displacement_at(displacement, x, y, motion.camera).movedim(-1, 0)
+        components = torch.from_numpy(spline(rows.clamp(grid[0], grid[-1])))
+        before, places = places, still + displacement_at(components, x, y, motion.camera).movedim(-1, 0)
         if float((places[along] - before[along]).abs().max()) < _CLOSE:
             break
     return (places - pixels).numpy(), weights
 
 
 def places_at_rest(motion: Motion, recorded: Array, starts: Array, exposure_time: float) -> Array:
-    """Places s (N, 2) in px from the centre of content that was recorded at ``q = s + D(s, t)``, the inverse of above.
+    """Places s (N, 2) in px from the centre of content that was recorded at ``q = s + D(s, t)``.
 
     The places q (N, 2) were recorded in exposures from ``starts`` (N,) in s on.
     """
-    displacement = motion.mean_displacement(torch.from_numpy(starts), exposure_time)
+    components = motion.mean_displacement(torch.from_numpy(starts), exposure_time)
     still = q = torch.from_numpy(recorded)
-    for _ in range(3):  # each makes the error smaller by the roll and zoom: 1e-4 px with 0.05 rad and 20 px
-        still = q - displacement_at(displacement, still[:, 0], still[:, 1], motion.camera)
+    for _ in range(3):  # each multiplies the error by about the roll and zoom: 1e-4 px with 0.05 rad and 20 px
+        still = q - displacement_at(components, still[:, 0], still[:, 1], motion.camera)
     return still.numpy()
 
 

@@ -158,8 +158,8 @@ class Camera:
         p1, p2 = self._tangential
         radial, slope = self._radial(u * u + v * v)
         mixed = u * v * slope + 2 * (p1 * u + p2 * v)
-        of_u, of_v = radial + u * u * slope + 2 * p1 * v + 6 * p2 * u, radial + v * v * slope + 6 * p1 * v + 2 * p2 * u
-        return torch.stack([of_u, mixed, mixed, of_v], -1).unflatten(-1, (2, 2))
+        by_u, by_v = radial + u * u * slope + 2 * p1 * v + 6 * p2 * u, radial + v * v * slope + 6 * p1 * v + 2 * p2 * u
+        return torch.stack([by_u, mixed, mixed, by_v], -1).unflatten(-1, (2, 2))
 
     def rays(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """(u, v) of the rays (u, v, 1) of image points in px from the centre of the frame, by Newton's method."""
@@ -178,11 +178,11 @@ class Camera:
             return along * factor, across * factor
         u, v = along, across
         for _ in range(_NEWTON_STEPS):
-            there = self._distorted(u, v)
+            distorted = self._distorted(u, v)
             a, b, c, d = self._distortion_slope(u, v).flatten(-2).unbind(-1)
-            error_x, error_y = along - there[0], across - there[1]
+            error_u, error_v = along - distorted[0], across - distorted[1]
             determinant = a * d - b * c
-            u, v = u + (d * error_x - b * error_y) / determinant, v + (a * error_y - c * error_x) / determinant
+            u, v = u + (d * error_u - b * error_v) / determinant, v + (a * error_v - c * error_u) / determinant
         return u, v
 
     def check_size(self, width: int, height: int) -> None:
@@ -191,7 +191,7 @@ class Camera:
         y = torch.linspace(-0.5, 0.5, 33, dtype=torch.float64)[:, None] * height
         u, v = self.rays(x, y)
         back = zip(self._distorted(u, v), self.principal_point, (x, y), strict=True)
-        missed = max(float((self.focal_length * found + centre - at).abs().amax()) for found, centre, at in back)
+        missed = max(float((self.focal_length * p + centre - at).abs().amax()) for p, centre, at in back)
         folded = bool((torch.linalg.det(self._distortion_slope(u, v)) <= 0).any())
         names = "k1, k2, k3, k4" if self.fisheye else "k1, k2, p1, p2, k3"
         if folded or not bool(torch.isfinite(torch.stack([u, v])).all()) or not missed < 1e-6:
@@ -221,11 +221,11 @@ class Camera:
         turned_x = cosine * u - sine * (yaw - roll * v) + along * pitch
         turned_y = cosine * v - sine * (roll * u - pitch) + along * yaw
         turned_z = cosine - sine * (pitch * v - yaw * u) + along * roll
-        turned = torch.stack(self._distorted(turned_x / turned_z, turned_y / turned_z), -1)
-        at_rest = torch.stack(self._distorted(u, v), -1)
+        displaced = torch.stack(self._distorted(turned_x / turned_z, turned_y / turned_z), -1)
+        still = torch.stack(self._distorted(u, v), -1)
         if components.shape[-1] > 3:
-            turned = turned * (1 + components[..., 3:])
-        return self.focal_length * (turned - at_rest)
+            displaced = displaced * (1 + components[..., 3:])
+        return self.focal_length * (displaced - still)
 
     def factors(self, x: Tensor, y: Tensor, axes: int) -> Tensor:
         """Displacement (S, 2, A) by unit components at positions (S) in px from the centre, for small angles."""
@@ -234,9 +234,9 @@ class Camera:
         x, y = torch.broadcast_tensors(x.to(u), y.to(u))
         f = self.focal_length
         rotation = torch.stack([1 + u * u, u * v, -f * v, u * v, 1 + v * v, f * u], -1).unflatten(-1, (2, 3))
-        moved = self._distortion_slope(u, v) @ rotation
+        rotated = self._distortion_slope(u, v) @ rotation
         zoomed = torch.stack([x - self.principal_point[0], y - self.principal_point[1]], -1)
-        return torch.cat([moved, zoomed[..., None]], -1)[..., :axes]
+        return torch.cat([rotated, zoomed[..., None]], -1)[..., :axes]
 
     def attitude(self, components: Tensor) -> Tensor:
         """(S, 3) rad: pitch, yaw and roll of the camera for components (S, A) of a motion."""
@@ -286,8 +286,8 @@ def _corners(width: float, height: float, like: Tensor) -> tuple[Tensor, Tensor]
 def largest_at(components: Tensor, x: Tensor, y: Tensor, camera: Camera | None) -> Tensor:
     """Bound (..., 2) in px on the displacement at P places (P, ...), by components within bounds (..., A)."""
     factors = displacement_factors(x, y, components.shape[-1], camera).abs().amax(0)
-    displacement: Tensor = (factors @ components[..., None])[..., 0]
-    return displacement if camera is None else displacement * _BEYOND_LINEAR
+    bound: Tensor = (factors @ components[..., None])[..., 0]
+    return bound if camera is None else bound * _BEYOND_LINEAR
 
 
 def largest_in_frame(components: Tensor, width: int, height: int, camera: Camera | None = None) -> Tensor:

@@ -119,8 +119,8 @@ def find_cameras(search: str = "") -> tuple[CameraMode, ...]:
 def _unknown(name: str, modes: Sequence[CameraMode]) -> ValueError:
     """The error of a name that no model has, with the models of some modes or else of similar names."""
     names = {_letters(key): f"{mode.brand} {mode.model}" for mode in _modes() for key in (mode.model, mode.name)}
-    near = [names[key] for key in difflib.get_close_matches(_letters(name), names, n=4)]
-    similar = [*dict.fromkeys([f"{mode.brand} {mode.model}" for mode in modes] or near)]
+    similar_names = [names[key] for key in difflib.get_close_matches(_letters(name), names, n=4)]
+    similar = [*dict.fromkeys([f"{mode.brand} {mode.model}" for mode in modes] or similar_names)]
     listed = ", ".join(similar[:4]) or "none"
     more = f" and {len(similar) - 4} more" if len(similar) > 4 else ""
     table = "table of readout times (rsvib cameras lists all)"
@@ -148,25 +148,25 @@ def camera_mode(name: str, *, width: int, height: int, frame_rate: float) -> Cam
     """
     size = check_whole_number("width", width, at_least=1), check_whole_number("height", height, at_least=1)
     rate = check_number("frame_rate", frame_rate, above=0.0)
-    similar = find_cameras(name)
+    candidates = find_cameras(name)
     modes = [
         mode
-        for mode in similar
+        for mode in candidates
         if _letters(name) in {_letters(b + mode.model + v) for b in ("", mode.brand) for v in ("", mode.lens)}
     ]
     if not modes:  # of "iPhone 7", "iPhone 7 Plus" is another camera
-        raise _unknown(name, similar)
-    sized = [one for one in modes if max(abs(one.width / size[0] - 1), abs(one.height / size[1] - 1)) <= _SAME_SIZE]
+        raise _unknown(name, candidates)
+    sized = [mode for mode in modes if max(abs(mode.width / size[0] - 1), abs(mode.height / size[1] - 1)) <= _SAME_SIZE]
     fitting = [mode for mode in sized if math.isclose(mode.frame_rate, rate, rel_tol=_SAME_RATE)]
     if not fitting:
-        known = ", ".join(
+        listed = ", ".join(
             f"{' '.join(filter(None, (mode.size, mode.lens)))} (readout {1e3 * mode.readout_time:.3g} ms)"
             for mode in sorted(modes, key=lambda mode: mode not in sized)
         )
-        other = "try the readout time of a known rate, which is right for two of three cameras, or " if sized else ""
+        remedy = "try the readout time of a known rate, which is right for two of three cameras, or " if sized else ""
         raise ValueError(
             f"no mode of {modes[0].brand} {modes[0].model} has the size and rate of {width} x {height} px at "
-            f"{rate:.4g}/s: {known}; {other}measure the row time (rsvib calibrate). Scaled frames take the readout "
+            f"{rate:.4g}/s: {listed}; {remedy}measure the row time (rsvib calibrate). Scaled frames take the readout "
             "time of their mode: row_time is this time / their rows"
         )
     names = dict.fromkeys(mode.name for mode in fitting)

@@ -55,7 +55,7 @@ class DetectedVibration(
         """A detection without what derived classes add to it."""
         if not isinstance(detection, DetectedVibration):
             raise TypeError(f"detection must be a DetectedVibration, got {described(detection)}")
-        return DetectedVibration(**{part.name: getattr(detection, part.name) for part in fields(DetectedVibration)})
+        return DetectedVibration(**{entry.name: getattr(detection, entry.name) for entry in fields(DetectedVibration)})
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -114,20 +114,20 @@ class DetectedVibration(
         lines: list[Table] = []
         for at, _ in tone_places(vibration):
             *batch, axis, tone = at
-            exists, unit = float(vibration.amplitude[at]) > 0, _UNITS_OF_AXES[axis]
+            is_tone, unit = float(vibration.amplitude[at]) > 0, _UNITS_OF_AXES[axis]
             line: Table = {"index": ", ".join(map(str, batch))} if batch else {}
             middle = self._middle_time(tuple(batch))
             line |= {} if middle is None else {"middle_time_s": middle}
-            line |= {"axis": AXIS_NAMES[axis], "tone": exists * (tone + 1)}
-            for name, of in (("frequency", "Hz"), ("amplitude", unit), ("phase", "rad")):
+            line |= {"axis": AXIS_NAMES[axis], "tone": is_tone * (tone + 1)}
+            for name, unit_name in (("frequency", "Hz"), ("amplitude", unit), ("phase", "rad")):
                 for kind, values in (("", vibration), ("_std", self.std), ("_std_if_hidden_tone", hidden)):
-                    line[f"{name}{kind}_{of}"] = plain_values(getattr(values, name)[at]) if exists else None
+                    line[f"{name}{kind}_{unit_name}"] = plain_values(getattr(values, name)[at]) if is_tone else None
             line[f"image_motion_{unit}_per_s"] = float(vibration.image_motion[at[:-1]])
             line |= {"reliable": bool(self.reliable[at[:-1]]), "reasons": self.codes(at[:-1])}
             if pixel_size is not None and axis < 2:
                 amplitude, frequency = float(vibration.amplitude[at]), float(vibration.frequency[at])
                 physical = physical_tone(amplitude, frequency, pixel_size)
-                line |= physical if exists else dict.fromkeys(physical)
+                line |= physical if is_tone else dict.fromkeys(physical)
                 line["image_motion_um_per_s"] = 1e6 * pixel_size * line["image_motion_px_per_s"]
             lines.append(line)
         return lines

@@ -83,7 +83,7 @@ class Motion(Result, ABC):
         """Motions with the same axes, knots and camera as a batch; the new dimension is the first."""
         batch = super().stacked(results)
         for name in ("camera", "start", "spacing"):
-            if any(getattr(one, name, None) != getattr(batch, name, None) for one in results):
+            if any(getattr(motion, name, None) != getattr(batch, name, None) for motion in results):
                 raise ValueError(f"motions with different {name} cannot be stacked")
         return batch
 
@@ -252,8 +252,8 @@ class ColumnMotion(Motion, shapes={"column": "..."}):
     def largest_oscillation(self) -> Tensor:
         """Bound on ``|D(t) - drift(t)|`` during the frames, (..., 2), in px."""
         last = self.frame_starts[-1] + (self.num_rows + 1) * self.row_time
-        turned = self.components.largest_displacement(self.frame_starts[0], last)  # roll and zoom with their drift
-        return self._at_ends_of_rows(torch.cat([self.components.largest_oscillation()[..., :2], turned[..., 2:]], -1))
+        bounds = self.components.largest_displacement(self.frame_starts[0], last)  # roll and zoom with their drift
+        return self._at_ends_of_rows(torch.cat([self.components.largest_oscillation()[..., :2], bounds[..., 2:]], -1))
 
     def displacement_within(self, duration: float) -> Tensor:
         """Bound on the displacement between two times ``duration`` seconds apart, (..., 2), in px."""
@@ -325,13 +325,13 @@ class ColumnStrips:
         """Images (B, ..., W) from strips (B S, ..., w), or on a finer grid whose first point lies at column 0."""
         last, scale = len(self.firsts) - 1, strips.shape[-1] // self.width
         step = self.middles[1] - self.middles[0] if last else 1.0
-        of_stacks = strips.unflatten(0, (-1, last + 1))
-        total = strips.new_zeros(*of_stacks[:, 0].shape[:-1], scale * self.frame_width)
+        values = strips.unflatten(0, (-1, last + 1))
+        total = strips.new_zeros(*values[:, 0].shape[:-1], scale * self.frame_width)
         place = torch.arange(scale * self.width, device=strips.device)
         for number, (first, middle) in enumerate(zip(self.firsts, self.middles, strict=True)):
             away = (place + scale * (first - middle)) / (scale * step)
             away = away.clamp(min=0.0) if number == 0 else away
             away = away.clamp(max=0.0) if number == last else away
             weight = (1 - away.abs()).clamp(min=0.0).to(strips.dtype)
-            total[..., scale * first : scale * (first + self.width)] += weight * of_stacks[:, number]
+            total[..., scale * first : scale * (first + self.width)] += weight * values[:, number]
         return total

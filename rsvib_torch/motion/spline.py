@@ -134,8 +134,8 @@ class FreeMotion(
         from scipy.interpolate import CubicSpline  # noqa: PLC0415
 
         grid, values = as_numbers("times", times).cpu(), as_numbers("displacement", displacement).cpu()
-        for name, given in (("times", grid), ("displacement", values)):
-            if given.requires_grad:
+        for name, value in (("times", grid), ("displacement", values)):
+            if value.requires_grad:
                 remedy = f"pass {name}.detach(), or evenly spaced times to through"
                 raise ValueError(f"from_samples has no gradient: {remedy}")
         _check_samples(grid, values)
@@ -194,8 +194,7 @@ class FreeMotion(
         count = self.coefficients.shape[-1]
         low = min(max(math.floor((first - self.start) / self.spacing), 0), count - 4)
         high = min(max(math.ceil((last - self.start) / self.spacing) + 3, low + 4), count)
-        start = self.start + low * self.spacing
-        return replace(self, coefficients=self.coefficients[..., low:high], start=start)
+        return replace(self, coefficients=self.coefficients[..., low:high], start=self.start + low * self.spacing)
 
     def with_axes(self, order: Sequence[int], signs: Sequence[float]) -> Self:
         """The motion whose component k is ``signs[k]`` (1 or -1) times component ``order[k]`` of this motion."""

@@ -163,8 +163,8 @@ class SensorTiming:
         row_time = check_number("row_time", row_time, above=0.0)
         exposure = check_number("exposure_time", exposure_time, above=0.0)
         period = 1 / check_number("frame_rate", frame_rate, above=0.0)
-        others = scan_axis, readout_direction, frame_start_times, row_time_std
-        return cls(row_time, exposure / row_time, period / row_time, *others)
+        settings = scan_axis, readout_direction, frame_start_times, row_time_std
+        return cls(row_time, exposure / row_time, period / row_time, *settings)
 
     @staticmethod
     def from_file(path: str | os.PathLike[str]) -> SensorTiming:
@@ -177,9 +177,8 @@ class SensorTiming:
             >>> SensorTiming.from_file("camera.toml").frame_rate  # doctest: +SKIP
             29.97
         """
-        data = read_toml(Path(path))
-        stated = {name: table for name, table in data.items() if name == "sensor"}
-        section: SensorSection = validate(_SensorFile, stated, str(path)).sensor
+        sections = {name: table for name, table in read_toml(Path(path)).items() if name == "sensor"}
+        section: SensorSection = validate(_SensorFile, sections, str(path)).sensor
         return section.to_timing()
 
     @property
@@ -354,7 +353,7 @@ class RowTiming(SensorTiming):
 
 
 def with_lost_frame(timing: SensorTiming, num_frames: int, first: int) -> SensorTiming:
-    """The timing of ``num_frames`` frames of which the one before the frame ``first`` was lost."""
+    """The timing of ``num_frames`` frames if a further frame was lost before the frame ``first``."""
     starts: list[float] = timing.frame_starts(num_frames).tolist()
     later = [start + timing.frame_period * (frame >= first) for frame, start in enumerate(starts)]
     return replace(timing, frame_start_times=tuple(later))
@@ -379,10 +378,10 @@ def row_axes(timing: SensorTiming, num_axes: int) -> tuple[list[int], list[float
 
 
 def other_intervals(timing: SensorTiming | RowTiming, starts: Tensor, num_rows: int) -> tuple[float, float] | None:
-    """Shortest and longest interval in s between frames that are not 1 to 3 frame periods apart, to 1 %.
+    """Shortest and longest interval in s between frames whose intervals are not whole frame periods, to 1 %.
 
-    Otherwise None, also for more missing frames between others, and for line sensors: frames of the latter have no
-    blanking rows, and start after delays.
+    None if they are and the shortest one is at most 3 periods, and for line sensors: their frames have no blanking
+    rows, and start after delays.
     """
     if len(starts) < 2 or timing.frame_rows <= num_rows:
         return None
@@ -395,8 +394,8 @@ def other_intervals(timing: SensorTiming | RowTiming, starts: Tensor, num_rows: 
 
 def contradiction(timing: SensorTiming | RowTiming, starts: Tensor, num_rows: int) -> str:
     """Sentence about starts of frames whose intervals are all far from the frame period; empty if they are not."""
-    least, most = other_intervals(timing, starts, num_rows) or (timing.frame_period, timing.frame_period)
-    if 0.9 * least <= timing.frame_period <= most / 0.9:
+    shortest, longest = other_intervals(timing, starts, num_rows) or (timing.frame_period, timing.frame_period)
+    if 0.9 * shortest <= timing.frame_period <= longest / 0.9:
         return ""
     return (
         f"by their times, frames are {float(starts.diff().median()):.3g} s apart, but the frame period is "

@@ -55,10 +55,10 @@ def _per_tone(values: dict[str, TensorLike], device: torch.device | None) -> lis
             continue
         count = tensors[name].shape[-2]
         if not 2 <= count <= 4 or tensors[name].shape[-1] == 0 or axes not in (0, count):
-            others = "" if axes in (0, count) else f"; the other values have {axes} axes"
+            counts = "" if axes in (0, count) else f"; the other values have {axes} axes"
             raise ValueError(
                 f"{name} must have shape (2,), (2, K) or (..., 2, K) for axes (x, y), with 3 for (x, y, roll) and 4 "
-                f"for (x, y, roll, zoom), got {tuple(tensor.shape)}{others}"
+                f"for (x, y, roll, zoom), got {tuple(tensor.shape)}{counts}"
             )
         axes = count
     return [tensor.expand(axes or 2, 1) if tensor.ndim == 0 else tensor for tensor in tensors.values()]
@@ -152,11 +152,11 @@ class Vibration(
         image_shift: TensorLike = (0.0, 0.0),
         camera: Camera | None = None,
     ) -> None:
-        given = (amplitude, frequency, phase, image_motion, image_acceleration, image_shift)
-        device = next((value.device for value in given if isinstance(value, Tensor)), None)
+        inputs = (amplitude, frequency, phase, image_motion, image_acceleration, image_shift)
+        device = next((value.device for value in inputs if isinstance(value, Tensor)), None)
         tones = _per_tone({"amplitude": amplitude, "frequency": frequency, "phase": phase}, device)
         axes = tones[0].shape[-2]
-        polynomial = [_per_axis(name, value, axes, device) for name, value in zip(_POLYNOMIAL, given[3:], strict=True)]
+        polynomial = [_per_axis(name, value, axes, device) for name, value in zip(_POLYNOMIAL, inputs[3:], strict=True)]
         try:
             tones = list(torch.broadcast_tensors(*tones))
             # torch.broadcast_shapes takes 40 us, and its first call imports sympy (0.3 s)
@@ -191,8 +191,8 @@ class Vibration(
         then image motion, image acceleration and image shift.
         """
         tones = (parameters.shape[-1] - 3) // 3
-        *of_tones, polynomial = parameters.split([tones, tones, tones, 3], -1)
-        values = dict(zip(_LIMITS, (*of_tones, *polynomial.unbind(-1)), strict=True))
+        *tone_values, polynomial = parameters.split([tones, tones, tones, 3], -1)
+        values = dict(zip(_LIMITS, (*tone_values, *polynomial.unbind(-1)), strict=True))
         return cls.__new__(cls)._changed(**values, camera=None)
 
     @property
@@ -204,10 +204,11 @@ class Vibration(
     @classmethod
     def _of_equal_shapes(cls, results: Sequence[Self]) -> Sequence[Self]:
         """Vibrations with as many tones as the one with most; missing tones have amplitude 0."""
-        missing = [max(other.amplitude.shape[-1] for other in results) - one.amplitude.shape[-1] for one in results]
+        most_tones = max(result.amplitude.shape[-1] for result in results)
+        missing = [most_tones - result.amplitude.shape[-1] for result in results]
         return [
-            one._changed(**{name: functional.pad(getattr(one, name), (0, tones)) for name in _QUANTITIES})
-            for one, tones in zip(results, missing, strict=True)
+            result._changed(**{name: functional.pad(getattr(result, name), (0, tones)) for name in _QUANTITIES})
+            for result, tones in zip(results, missing, strict=True)
         ]
 
     def scaled(self, factor: Tensor | float) -> "Vibration":
@@ -303,8 +304,7 @@ class Vibration(
         Tones below 1e-4 px do not count, roll and zoom below 1e-7: 1e-4 px at 1000 px from the centre.
         """
         smallest = self.amplitude.new_tensor([1e-4, 1e-4, 1e-7, 1e-7][: self.amplitude.shape[-2]])
-        visible = self.amplitude > smallest[:, None]
-        return torch.where(visible, self.frequency * duration, 0.0).amax(-1).detach()
+        return torch.where(self.amplitude > smallest[:, None], self.frequency * duration, 0.0).amax(-1).detach()
 
     def with_axes(self, order: Sequence[int], signs: Sequence[float]) -> Self:
         """The vibration whose component k is ``signs[k]`` times component ``order[k]``; amplitudes stay positive."""

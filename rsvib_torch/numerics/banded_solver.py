@@ -11,10 +11,10 @@ Forward substitution solves ``U^H D y = g``, back substitution ``U x = y``. Ever
 batch of matrices.
 
 A system is eliminated from both ends at a time, which halves the number of steps: the last rows in reverse order are
-the second half of the batch. ``from_both_ends`` has the two halves, each of which contains the b or b + 1 middle rows.
-What both eliminations leave of the middle is one small matrix.
+the second half of the batch. ``from_both_ends`` makes the two halves, each with the b or b + 1 middle rows. Both
+eliminations together turn the middle rows into one small matrix.
 
-``InterpolatedFactors`` are those of systems that change smoothly with frequency: some are computed, the others are
+``InterpolatedFactors`` are factors of systems that change smoothly with frequency: some are computed, the others are
 interpolated.
 """
 
@@ -29,15 +29,15 @@ from torch.autograd.function import BackwardCFunction, once_differentiable
 def _eliminated(skewed: Tensor, steps: int) -> tuple[Tensor, Tensor]:
     """Eliminate the first rows of skewed matrices (K + b, 2 b + 1, S), in their memory: ``upper`` and ``inverse``."""
     width, (line, entry, _) = skewed.shape[1] // 2, skewed.stride()
-    first = skewed.storage_offset() + line
+    origin = skewed.storage_offset() + line
     pivots, upper = skewed[:steps, width], skewed[: len(skewed) - width, width + 1 :]
     # A[i, j] of step j, and A[i, k]: strided views, because row j + 1 begins one column further right
     strides = (line, line - entry, entry, 1)
-    below = skewed.as_strided((steps, width, 1, skewed.shape[2]), strides, first + (width - 1) * entry)
-    trailing = skewed.as_strided((steps, width, width, skewed.shape[2]), strides, first + width * entry)
+    below = skewed.as_strided((steps, width, 1, skewed.shape[2]), strides, origin + (width - 1) * entry)
+    trailing = skewed.as_strided((steps, width, width, skewed.shape[2]), strides, origin + width * entry)
     views = (pivots, upper[:steps], below, trailing)
-    for pivot, row, column, remaining in zip(*(values.unbind() for values in views), strict=True):
-        remaining.addcmul_(column, row.div_(pivot), value=-1)
+    for pivot, row, column, block in zip(*(values.unbind() for values in views), strict=True):
+        block.addcmul_(column, row.div_(pivot), value=-1)
     inverse = pivots.reciprocal()
     return upper, inverse.real if inverse.is_complex() else inverse
 
@@ -54,9 +54,9 @@ def from_both_ends(skewed: Tensor) -> Tensor:
     half = count - steps
     first, second = skewed[:half], skewed[steps:count].flip(0, 1)
     row = np.arange(half)[:, None]
-    of_middle = (row >= steps) & (row + np.arange(-width, width + 1) >= steps)
-    between = torch.from_numpy(of_middle).to(skewed.device).view(half, 2 * width + 1, *(1,) * (skewed.ndim - 2))
-    halves = torch.stack([first, second.masked_fill(between, 0)], 2)
+    in_middle = (row >= steps) & (row + np.arange(-width, width + 1) >= steps)
+    middle_entries = torch.from_numpy(in_middle).to(skewed.device).view(half, 2 * width + 1, *(1,) * (skewed.ndim - 2))
+    halves = torch.stack([first, second.masked_fill(middle_entries, 0)], 2)
     return torch.cat([halves, halves.new_zeros(width, *halves.shape[1:])])
 
 
@@ -67,8 +67,8 @@ class BandedFactor:
     # (H, b, 2 S), ``[j, i - 1]`` is ``U[j, j + i]``; rows that are not eliminated are 0
     upper: Tensor
     inverse: Tensor  # (steps, 2 S), ``1 / d_j`` of the eliminated rows, real
-    # U^-1 (m, m, S) and 1 / D (m, S) of what is left of the m middle rows: the inverse of the matrix itself loses three
-    # times as much to rounding
+    # U^-1 (m, m, S) and 1 / D (m, S) of the matrix that the elimination leaves of the m middle rows: the inverse of the
+    # matrix itself loses three times as much to rounding
     middle: Tensor
     middle_inverse: Tensor
 
@@ -93,10 +93,10 @@ class BandedFactor:
         """Solve ``A x = right_side`` for right sides (K, M, S)."""
         (half, width, size), steps = self.upper.shape, len(self.inverse)
         x = right_side.new_empty(half + width, right_side.shape[1], size)
-        both = x[:half]
-        both.copy_(self.halves(right_side).conj())
-        first, second = both.split(right_side.shape[-1], -1)
-        second[steps:] = 0
+        halves = x[:half]
+        halves.copy_(self.halves(right_side).conj())
+        first_half, second_half = halves.split(right_side.shape[-1], -1)
+        second_half[steps:] = 0
         x[half:] = 0
         # U right of the diagonal, (b, 1, 2 S) of each row, and above it, of the columns from b on; views of x
         upper = self.upper[:steps, :, None].unbind()
@@ -104,25 +104,25 @@ class BandedFactor:
         first_column = self.upper.storage_offset() + (width - 1) * entry
         shape = (max(0, half - width), width, 1, size)
         columns = self.upper.as_strided(shape, (line, line - entry, entry, 1), first_column).unbind()
-        rows, runs = both.unbind(), x.unfold(0, width, 1).movedim(-1, 1).unbind()
+        rows, runs = halves.unbind(), x.unfold(0, width, 1).movedim(-1, 1).unbind()
         # 1. U^H y = g is U^T y^* = g^*: both substitutions use the same U.
         for value, row, below in zip(rows, upper, runs[1:], strict=False):
             below.addcmul_(row, value, value=-1)
         if x.is_complex():
             x.conj_physical_()
         x[:steps].mul_(self.inverse[:, None])
-        # 2. What both ends leave of the middle rows.
-        middle = first[steps:] + second[steps:].flip(0)
+        # 2. The middle rows, after both eliminations.
+        middle = first_half[steps:] + second_half[steps:].flip(0)
         middle = (self.middle.conj()[:, :, None] * middle[:, None]).sum(0) * self.middle_inverse[:, None]
         middle = (self.middle[:, :, None] * middle).sum(1)
-        both[steps:] = torch.cat([middle, middle.flip(0)], -1)
+        halves[steps:] = torch.cat([middle, middle.flip(0)], -1)
         # 3. U x = y, the first b rows one by one.
         for j in range(half - 1, width - 1, -1):
             runs[j - width].addcmul_(columns[j - width], rows[j], value=-1)
         for j in range(min(width - 1, steps) - 1, -1, -1):
             later = x[j + 1 : width]
             rows[j].sub_((upper[j][: len(later)] * later).sum(0))
-        return torch.cat([first, second[:steps].flip(0)])
+        return torch.cat([first_half, second_half[:steps].flip(0)])
 
 
 def factor_banded(halves: Tensor, count: int) -> BandedFactor:
@@ -169,13 +169,13 @@ class _Solve(torch.autograd.Function):
         if not ctx.needs_input_grad[0]:
             return None, adjoint
         count, width, size = factor.upper.shape
-        one, other = factor.halves(adjoint), factor.halves(x.conj())
-        of_matrix = one.new_zeros(count + width, 2 * width + 1, size)
+        adjoint_halves, solution_halves = factor.halves(adjoint), factor.halves(x.conj())
+        matrix_gradient = adjoint_halves.new_zeros(count + width, 2 * width + 1, size)
         for d in range(-min(width, count - 1), min(width, count - 1) + 1):
             rows = slice(max(0, -d), min(count, count - d))
             columns = slice(max(0, d), min(count, count + d))
-            of_matrix[rows, width + d] = -(one[rows] * other[columns]).sum(1)
-        return of_matrix, adjoint
+            matrix_gradient[rows, width + d] = -(adjoint_halves[rows] * solution_halves[columns]).sum(1)
+        return matrix_gradient, adjoint
 
 
 def solve_halves(system: Tensor | BandedFactor, right_side: Tensor) -> Tensor:
@@ -221,9 +221,9 @@ class InterpolatedFactors:
         frequencies = torch.arange(part.start, part.stop, dtype=torch.float64, device=self.nodes.device)
         ends = torch.searchsorted(self.nodes, frequencies[[0, -1]].long(), right=True)
         first, last = ends.clamp(max=len(self.nodes) - 1).tolist()
-        near = slice(first - 1, last + 1)
-        places = self.nodes[near].to(torch.float64)
+        nodes = slice(first - 1, last + 1)
+        places = self.nodes[nodes].to(torch.float64)
         rising = (frequencies - places[:-1, None]) / places.diff()[:, None]
-        one = torch.ones_like(rising[:1])
-        hat = torch.minimum(torch.cat([one, rising]), torch.cat([1 - rising, one])).clamp(min=0)  # (nodes, S)
-        return BandedFactor(*((values[..., near] @ hat.to(values)).flatten(-2) for values in self.tensors))
+        ones = torch.ones_like(rising[:1])
+        hat = torch.minimum(torch.cat([ones, rising]), torch.cat([1 - rising, ones])).clamp(min=0)  # (nodes, S)
+        return BandedFactor(*((values[..., nodes] @ hat.to(values)).flatten(-2) for values in self.tensors))

@@ -23,9 +23,9 @@ def bspline_weights(fraction: Tensor, degree: int, derivative: int = 0) -> Tenso
     if derivative:
         lower = bspline_weights(fraction, degree - 1, derivative - 1)
         return torch.nn.functional.pad(lower, (1, 0)) - torch.nn.functional.pad(lower, (0, 1))
-    highest, *others = constant(_polynomials, degree, dtype=fraction.dtype, device=fraction.device)
+    highest, *lower_powers = constant(_polynomials, degree, dtype=fraction.dtype, device=fraction.device)
     weights: Tensor = highest
-    for lower in others:
+    for lower in lower_powers:
         weights = torch.addcmul(lower, weights, fraction[..., None])
     return weights
 
@@ -65,8 +65,8 @@ def _polynomials(degree: int) -> Array:
     """
     powers: Array = np.ones((1, 1))
     for n in range(1, degree + 1):
-        tap, one, other = np.arange(n + 1), np.pad(powers, ((0, 0), (1, 0))), np.pad(powers, ((0, 0), (0, 1)))
-        rising, constant_part = one - other, (n - tap) * one + (tap + 1) * other
+        tap, same, shifted = np.arange(n + 1), np.pad(powers, ((0, 0), (1, 0))), np.pad(powers, ((0, 0), (0, 1)))
+        rising, constant_part = same - shifted, (n - tap) * same + (tap + 1) * shifted
         powers = (np.pad(rising, ((0, 1), (0, 0))) + np.pad(constant_part, ((1, 0), (0, 0)))) / n
     return powers
 
@@ -106,8 +106,8 @@ def bspline_coefficient_rows(samples: Tensor, degree: int) -> Iterator[Tensor]:
     fits = samples.numel() <= (1 << 20 if on_cpu else 1 << 24)  # the cache, or the memory
     kernel, index = _inverse_filter_of(samples, degree, -2)
     for rows in runs(height, height if fits else 64 if on_cpu else 256):
-        near = samples.index_select(-2, index[rows.start : rows.stop + kernel.shape[-1] - 1])
-        yield correlated(near, kernel, -2)[0]
+        neighbours = samples.index_select(-2, index[rows.start : rows.stop + kernel.shape[-1] - 1])
+        yield correlated(neighbours, kernel, -2)[0]
 
 
 def bspline_coefficients(samples: Tensor, degree: int, dim: int) -> Tensor:
@@ -146,15 +146,15 @@ def correlated(samples: Tensor, kernels: Tensor, dim: int, step: int = 1) -> Ten
     span, count = (block - 1) * step + taps, length // block
     matrix = _toeplitz(kernels, block, step)
     windows = rows.unfold(-2, span, block * step).mT  # (..., count, span, W)
-    every = windows.reshape(-1, *windows.shape[-2:])
-    products = torch.bmm(matrix.reshape(1, -1, span).expand(len(every), -1, -1), every)
+    flat = windows.reshape(-1, *windows.shape[-2:])
+    products = torch.bmm(matrix.reshape(1, -1, span).expand(len(flat), -1, -1), flat)
     values: Tensor = products.view(*windows.shape[:-2], number, block, -1).movedim(-3, 0).flatten(-3, -2)
     # 2. The values behind the last whole block.
-    remainder = length - count * block
-    if remainder:
-        near = (remainder - 1) * step + taps
-        last = matrix[:, :remainder, :near].flatten(0, 1) @ rows[..., count * block * step :, :][..., :near, :]
-        values = torch.cat([values, last.unflatten(-2, (number, remainder)).movedim(-3, 0)], -2)
+    remaining = length - count * block
+    if remaining:
+        needed = (remaining - 1) * step + taps
+        last = matrix[:, :remaining, :needed].flatten(0, 1) @ rows[..., count * block * step :, :][..., :needed, :]
+        values = torch.cat([values, last.unflatten(-2, (number, remaining)).movedim(-3, 0)], -2)
     return values.movedim(-2, dim + 1 if dim >= 0 else dim)
 
 
@@ -245,7 +245,7 @@ def extend_rows(images: Tensor, length: int, hold: float = 0.25) -> Tensor:
         return images
     sources = constant(_mirrored_ends, width, extra, dtype=torch.int64, device=images.device)
     share = constant(_blend, extra, hold, dtype=images.dtype, device=images.device)
-    # twice the end minus what is mirrored, of both ends; index_select is four times as fast as an index
+    # twice the end minus the mirrored pixels, at both ends; index_select is four times as fast as an index
     after, before = images.index_select(-1, sources).chunk(2, -1)
     ends = torch.lerp(images[..., :1], images[..., -1:], share)
     return torch.cat([images, 2 * ends - torch.lerp(before, after, share)], dim=-1)

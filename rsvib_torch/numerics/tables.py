@@ -20,7 +20,7 @@ Stacks = TypeVar("Stacks", bound="DataclassInstance")
 
 
 def table(values: Tensor) -> Array:
-    """A tensor as an array on the CPU; one on the CPU shares its memory."""
+    """A tensor as an array on the CPU, which shares the memory of a tensor on the CPU."""
     if values.requires_grad:
         values = values.detach()
     if values.is_conj():
@@ -70,7 +70,7 @@ def pseudo_inverse(matrix: Array) -> Array:
 
 
 def scaled_inverse(matrix: Array) -> Array:
-    """Pseudo-inverse of normal matrices (..., P, P) of parameters of any units; 0 for what they do not determine."""
+    """Pseudo-inverse of normal matrices (..., P, P) of parameters of any units; 0 for undetermined combinations."""
     diagonal = matrix.diagonal(axis1=-2, axis2=-1)
     unit = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     unit = unit[..., :, None] * unit[..., None, :]
@@ -113,25 +113,25 @@ def constant(make: Callable[..., Array], *arguments: object, dtype: torch.dtype,
 def tables(*values: Tensor) -> list[Array]:
     """Tensors as arrays on the CPU, by one transfer; those of a GPU become float64."""
     if values[0].device.type == "cpu":
-        return [table(part) for part in values]
-    flat = table(torch.cat([part.to(torch.float64).flatten() for part in values]))
-    parts = np.split(flat, np.cumsum([part.numel() for part in values])[:-1])
-    return [array.reshape(part.shape) for array, part in zip(parts, values, strict=True)]
+        return [table(value) for value in values]
+    flat = table(torch.cat([value.to(torch.float64).flatten() for value in values]))
+    parts = np.split(flat, np.cumsum([value.numel() for value in values])[:-1])
+    return [array.reshape(value.shape) for array, value in zip(parts, values, strict=True)]
 
 
 # Dataclasses of arrays whose first axis is the batch of stacks
 
 
 def take_stacks(parts: Sequence[Stacks], index: Array) -> Stacks:
-    """The stacks ``index`` of several dataclasses behind each other; values without a batch are those of the first."""
-    taken = {}
+    """The stacks ``index`` of several concatenated dataclasses; values without a batch are those of the first."""
+    arrays = {}
     for field in fields(parts[0]):
         values = [getattr(part, field.name) for part in parts]
         if isinstance(values[0], np.ndarray):
-            taken[field.name] = (np.concatenate(values) if len(values) > 1 else values[0])[index]
+            arrays[field.name] = (np.concatenate(values) if len(values) > 1 else values[0])[index]
         elif is_dataclass(values[0]):
-            taken[field.name] = take_stacks(values, index)
-    return replace(parts[0], **taken)
+            arrays[field.name] = take_stacks(values, index)
+    return replace(parts[0], **arrays)
 
 
 def select_stacks(where: Array, one: Stacks, other: Stacks) -> Stacks:

@@ -78,10 +78,8 @@ class Corners:
     def joined(parts: Sequence["Corners"]) -> "Corners":
         """The corners of all pairs."""
         pairs = np.concatenate([np.full(len(part.rows), number) for number, part in enumerate(parts)])
-        following = (
-            [getattr(part, name) for part in parts] for name in ("rows", "times", "places", "offsets", "layer", "blur")
-        )
-        return Corners(pairs, *(np.concatenate(values) for values in following))
+        names = ("rows", "times", "places", "offsets", "layer", "blur")
+        return Corners(pairs, *(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 class CornerFollower:
@@ -104,39 +102,38 @@ class CornerFollower:
         """
         # 1. Follow corners.
         (height, width), timing, scale = grey.shape, self._timing, reduction(*grey.shape)
-        before, known, voted = self._before, self._known, self._votes
+        before, corners_before, votes_before = self._before, self._known, self._votes
         small = cv2.resize(grey, (width // scale, height // scale), interpolation=cv2.INTER_AREA)
-        around = cv2.blur(small, (_AROUND, _AROUND))
-        second = np.asarray(cv2.addWeighted(small, 1.0, around, -1.0, 128.0), np.uint8)
-        exposed = np.array([self._start, start])
+        second = np.asarray(cv2.addWeighted(small, 1.0, cv2.blur(small, (_AROUND, _AROUND)), -1.0, 128.0), np.uint8)
+        starts = np.array([self._start, start])
         self._before, self._start = second, start
         self._known, self._votes = _NO_CORNERS
         if before is None:
             return None
-        starts = find_corners(before, self._most, known)
-        votes = np.pad(voted, (0, len(starts) - len(voted)))
-        ends, good = follow_corners(before, second, starts)
-        starts, ends, votes = starts[good], ends[good], votes[good]
+        corners = find_corners(before, self._most, corners_before)
+        votes = np.pad(votes_before, (0, len(corners) - len(votes_before)))
+        ends, followed = follow_corners(before, second, corners)
+        corners, ends, votes = corners[followed], ends[followed], votes[followed]
         # 2. Keep those that are at rest if the camera is, else those that follow one affine motion and the vibration of
         # their rows.
-        agree = np.hypot(*(ends - starts).T) < _AT_REST
-        if not _stands_still(starts, agree, second.shape):
+        agrees = np.hypot(*(ends - corners).T) < _AT_REST
+        if not _stands_still(corners, agrees, second.shape):
             axis = 1 if timing.scan_axis == -2 else 0
-            agree = _agreeing(starts, ends, axis, second.shape[1 - axis], scale)
-            least = min(_MIN_SHARE * len(good), _MIN_FOLLOWED * len(starts))
-            if agree.sum() < max(_MIN_CORNERS, least):
+            agrees = _agreeing(corners, ends, axis, second.shape[1 - axis], scale)
+            least = min(_MIN_SHARE * len(followed), _MIN_FOLLOWED * len(corners))
+            if agrees.sum() < max(_MIN_CORNERS, least):
                 return None
-        starts, ends, votes = starts[agree], ends[agree], votes[agree]
-        layer = _in_layer(starts, ends, votes, scale)
+        corners, ends, votes = corners[agrees], ends[agrees], votes[agrees]
+        layer = _in_layer(corners, ends, votes, scale)
         self._known, self._votes = ends, np.where(layer, votes + 1, np.minimum(votes, 0) - 1)
-        blur = blur_products(before, second, starts, ends) if self._compare_blur else np.zeros((len(starts), 4, 4))
+        blur = blur_products(before, second, corners, ends) if self._compare_blur else np.zeros((len(corners), 4, 4))
         # 3. Their places in the frames, and the times of their rows.
-        starts, ends = ((points + 0.5) * scale - 0.5 for points in (starts, ends))
-        rows = rows_of_points(np.stack([starts, ends], 1), timing, grey.shape)
-        times = exposed + rows * timing.row_time + 0.5 * timing.exposure_time
-        places = 0.5 * (starts + ends) - 0.5 * (np.array([width, height]) - 1)
+        corners, ends = ((points + 0.5) * scale - 0.5 for points in (corners, ends))
+        rows = rows_of_points(np.stack([corners, ends], 1), timing, grey.shape)
+        times = starts + rows * timing.row_time + 0.5 * timing.exposure_time
+        places = 0.5 * (corners + ends) - 0.5 * (np.array([width, height]) - 1)
         part = rows[:, 0] / grey.shape[int(timing.scan_axis)]
-        return Corners(np.zeros(len(starts), np.int64), part, times, places, ends - starts, layer, blur)
+        return Corners(np.zeros(len(corners), np.int64), part, times, places, ends - corners, layer, blur)
 
 
 def rows_of_points(points: Array, timing: SensorTiming, size: tuple[int, ...]) -> Array:
@@ -146,49 +143,48 @@ def rows_of_points(points: Array, timing: SensorTiming, size: tuple[int, ...]) -
     return rows if timing.readout_direction == "forward" else size[1 - axis] - 1 - rows
 
 
-def _agreeing(starts: Points, ends: Points, axis: int, length: int, scale: int) -> NDArray[np.bool_]:
+def _agreeing(corners: Points, ends: Points, axis: int, length: int, scale: int) -> NDArray[np.bool_]:
     """(N,) bool, whether corners move with most others of their rows, along ``axis`` of ``length``."""
-    agree = np.zeros(len(starts), bool)
-    if len(starts) < _MIN_CORNERS:
-        return agree
+    agrees = np.zeros(len(corners), bool)
+    if len(corners) < _MIN_CORNERS:
+        return agrees
     wobble, limit = (max(1.0, limit / scale) for limit in (_WOBBLE, _AGREE))
-    affine, inliers = cv2.estimateAffine2D(starts, ends, method=cv2.USAC_MAGSAC, ransacReprojThreshold=wobble)
+    affine, inliers = cv2.estimateAffine2D(corners, ends, method=cv2.USAC_MAGSAC, ransacReprojThreshold=wobble)
     if affine is None:
-        return agree
-    inside, residual = inliers[:, 0] > 0, ends - starts @ affine[:, :2].T - affine[:, 2]
-    parts = (starts[:, axis] * _PARTS / length).astype(np.int64)
+        return agrees
+    inside, residual = inliers[:, 0] > 0, ends - corners @ affine[:, :2].T - affine[:, 2]
+    parts = (corners[:, axis] * _PARTS / length).astype(np.int64)
     for number in np.unique(parts[inside]):
-        part = inside & (parts == number)
-        common = np.median(residual[part], 0) if part.sum() >= _MIN_CORNERS else 0.0
-        agree[part] = np.hypot(*(residual[part] - common).T) < limit
-    return agree
+        in_part = inside & (parts == number)
+        common = np.median(residual[in_part], 0) if in_part.sum() >= _MIN_CORNERS else 0.0
+        agrees[in_part] = np.hypot(*(residual[in_part] - common).T) < limit
+    return agrees
 
 
-def _in_layer(starts: Points, ends: Points, votes: NDArray[np.int64], scale: int) -> NDArray[np.bool_]:
+def _in_layer(corners: Points, ends: Points, votes: NDArray[np.int64], scale: int) -> NDArray[np.bool_]:
     """(N,) bool, whether corners move with the layer that is followed; all of them if there is no layer.
 
-    A layer is a part of the scene that moves as one similarity. A vibration moves its rows apart: of several limits,
-    the smallest counts within which half of the corners that decide are. Frames are reduced by ``scale``; the ``votes``
-    of corners are the pairs in which they moved with the layer or, negative, apart from it since then.
+    A layer is a part of the scene that moves as one similarity. A vibration displaces its rows differently: the limit
+    is the smallest of several that half of the deciding corners are within. Frames are reduced by ``scale``. The
+    ``votes`` of a corner count the pairs in which it moved with the layer; negative votes, those since it left it.
     """
     # 1. The corners that decide: those that moved with the layer last, else those that did not move apart from it. A
     # subject moves with the layer for a moment, and apart from it later.
     least = max(_MIN_CORNERS, _MIN_SHARE * len(votes))
-    decide = next((of for of in (votes > 0, votes >= 0) if of.sum() >= least), np.ones(len(starts), bool))
-    # 2. The motion of the layer, and what moves like it.
+    decide = next((of for of in (votes > 0, votes >= 0) if of.sum() >= least), np.ones(len(corners), bool))
+    # 2. The motion of the layer, and the corners that move like it.
     for limit in _LAYER_LIMITS / scale:
-        similarity, inside = cv2.estimateAffinePartial2D(starts[decide], ends[decide], ransacReprojThreshold=limit)
+        similarity, inside = cv2.estimateAffinePartial2D(corners[decide], ends[decide], ransacReprojThreshold=limit)
         if similarity is not None and inside.mean() > 0.5:
-            residual = ends - starts @ similarity[:, :2].T - similarity[:, 2]
-            return np.asarray(np.hypot(*residual.T) < 2 * limit)
-    return np.ones(len(starts), bool)
+            return np.asarray(np.hypot(*(ends - corners @ similarity[:, :2].T - similarity[:, 2]).T) < 2 * limit)
+    return np.ones(len(corners), bool)
 
 
-def _stands_still(starts: Points, rests: NDArray[np.bool_], shape: tuple[int, ...]) -> bool:
-    """Whether the camera stands still: most corners rest in the cells at two opposite sides of a frame (H, W)."""
+def _stands_still(corners: Points, still: NDArray[np.bool_], shape: tuple[int, ...]) -> bool:
+    """Whether the camera stands still: most corners near two opposite sides of a frame (H, W) are at rest."""
     rows, columns = _grid(*shape)
-    cells = _cells_of(starts, shape)
-    count, at_rest = (np.bincount(cells, weights, rows * columns).reshape(rows, columns) for weights in (None, rests))
+    cells = _cells_of(corners, shape)
+    count, at_rest = (np.bincount(cells, weights, rows * columns).reshape(rows, columns) for weights in (None, still))
     mostly = at_rest > 0.5 * count
     left, right, top, bottom = (mostly[part].sum() >= _OF_SIDE * (count[part] > 0).sum() > 0 for part in _SIDES)
     return bool((left and right) or (top and bottom))
@@ -206,7 +202,7 @@ def eight_bits(frame: Array, levels: Array | None = None) -> Grey:
 
 
 def reduction(height: int, width: int) -> int:
-    """By how much the sides of frames are reduced before corners are followed."""
+    """Factor by which the sides of frames are reduced before corners are followed."""
     return int(2 ** max(0, math.ceil(0.5 * math.log2(height * width / _MOST_PIXELS))))
 
 
@@ -251,79 +247,80 @@ def _cells_of(points: Points, shape: tuple[int, ...]) -> NDArray[np.int64]:
     return np.asarray(columns * y + x)
 
 
-def find_corners(grey: Grey, most: int, known: Points = _NO_CORNERS[0], mask: Grey | None = None) -> Points:
-    """The known corners (N, 2) of a frame (H, W), and new ones where a cell has less than half of its number.
+def find_corners(grey: Grey, max_corners: int, known: Points = _NO_CORNERS[0], mask: Grey | None = None) -> Points:
+    """The known corners (N, 2) of a frame (H, W), and new ones in cells with less than half of the permitted number.
 
-    All cells have the same number, together at most ``most`` corners. There are none where the mask (H, W) is 0.
+    All cells may have the same number of corners, in total about ``max_corners``; none where the mask (H, W) is 0.
     """
     height, width = grey.shape
     rows, columns = _grid(height, width)
-    number = -(-most // (rows * columns))
-    distance = max(3.0, 0.5 * min(height, width) / _CELLS / math.sqrt(number))
+    per_cell = -(-max_corners // (rows * columns))
+    distance = max(3.0, 0.5 * min(height, width) / _CELLS / math.sqrt(per_cell))
     quality = cv2.cornerMinEigenVal(grey, 3)  # as in goodFeaturesToTrack
     floor = min(_NOISE * float(np.median(quality[::3, ::3])), _FAINT * float(quality.max()))
     filled = np.bincount(_cells_of(known, grey.shape), minlength=rows * columns).reshape(rows, columns)
     corners = [known]
-    for row, column in zip(*np.nonzero(filled <= number // 2), strict=True):
+    for row, column in zip(*np.nonzero(filled <= per_cell // 2), strict=True):
         top, left = row * height // rows, column * width // columns
         part = slice(top, (row + 1) * height // rows), slice(left, (column + 1) * width // columns)
         inner = None if mask is None else np.ascontiguousarray(mask[part])
-        strongest = cv2.goodFeaturesToTrack(grey[part], number, _QUALITY, distance, mask=inner)
-        if strongest is not None:
-            x, y = strongest[:, 0].T.astype(np.int64) + np.array([[left], [top]])
+        points = cv2.goodFeaturesToTrack(grey[part], per_cell, _QUALITY, distance, mask=inner)
+        if points is not None:
+            x, y = points[:, 0].T.astype(np.int64) + np.array([[left], [top]])
             places = np.stack([x, y], -1)[quality[y, x] > floor].astype(np.float64)
-            is_new = np.abs(places[:, None] - known).max(-1).min(-1, initial=np.inf) >= distance
-            corners.append(places[is_new][: number - filled[row, column]])
+            is_far = np.abs(places[:, None] - known).max(-1).min(-1, initial=np.inf) >= distance
+            corners.append(places[is_far][: per_cell - filled[row, column]])
     return np.concatenate(corners)
 
 
-def follow_corners(first: Grey, second: Grey, corners: Points) -> tuple[Points, NDArray[np.bool_]]:
+def follow_corners(before: Grey, after: Grey, corners: Points) -> tuple[Points, NDArray[np.bool_]]:
     """Places (N, 2) of corners of the first frame in the second, and whether (N) the way back ends at the corner."""
     if not len(corners):
         return corners, np.zeros(0, bool)
-    levels = max(1, math.ceil(math.log2(_LARGEST_MOTION * max(first.shape) / _COARSE)) + 1)
+    levels = max(1, math.ceil(math.log2(_LARGEST_MOTION * max(before.shape) / _COARSE)) + 1)
     start = corners.astype(np.float32)[:, None]
     coarse, fine = (_COARSE, _COARSE), (PATCH, PATCH)
-    end, there, _ = cv2.calcOpticalFlowPyrLK(first, second, start, start.copy(), winSize=coarse, maxLevel=levels)
+    end, coarse_ok, _ = cv2.calcOpticalFlowPyrLK(before, after, start, start.copy(), winSize=coarse, maxLevel=levels)
     guess = cv2.OPTFLOW_USE_INITIAL_FLOW
-    end, again, _ = cv2.calcOpticalFlowPyrLK(first, second, start, end, winSize=fine, maxLevel=0, flags=guess)
-    back, return_, _ = cv2.calcOpticalFlowPyrLK(second, first, end, start.copy(), winSize=fine, maxLevel=0, flags=guess)
-    returned = np.abs(back - start).max((1, 2)) < _MAX_RETURN
-    inside = ((end[:, 0] >= 0) & (end[:, 0] <= np.array(first.shape[::-1]) - 1)).all(1)
-    good = returned & inside & (there[:, 0] == 1) & (again[:, 0] == 1) & (return_[:, 0] == 1)
-    return end[:, 0].astype(np.float64), good
+    end, fine_ok, _ = cv2.calcOpticalFlowPyrLK(before, after, start, end, winSize=fine, maxLevel=0, flags=guess)
+    back, back_ok, _ = cv2.calcOpticalFlowPyrLK(after, before, end, start.copy(), winSize=fine, maxLevel=0, flags=guess)
+    returns = np.abs(back - start).max((1, 2)) < _MAX_RETURN
+    inside = ((end[:, 0] >= 0) & (end[:, 0] <= np.array(before.shape[::-1]) - 1)).all(1)
+    followed = returns & inside & (coarse_ok[:, 0] == 1) & (fine_ok[:, 0] == 1) & (back_ok[:, 0] == 1)
+    return end[:, 0].astype(np.float64), followed
 
 
-def blur_products(first: Grey, second: Grey, starts: Array, ends: Array) -> Array:
+def blur_products(first: Grey, second: Grey, corners: Array, ends: Array) -> Array:
     """(N, 4, 4) products of patches around corners (N, 2) of two frames (H, W), for a fit of their blur.
 
-    They are those of half of the second derivatives along x, of the mixed ones, of half of those along y, and of the
-    difference of both patches; of each, the parts are left out that brightness, contrast, a displacement, and one that
-    changes linearly over the patch explain.
+    The factors are half of the second derivative along x, the mixed one, half of that along y, and the difference of
+    both patches, each without the part that is explained by brightness, contrast, a displacement, or a displacement
+    that changes linearly over the patch.
     """
     steps = np.arange(-_HALF_PATCH - 1, _HALF_PATCH + 2, dtype=np.float32)
 
-    def patches(frame: Grey, centres: Array) -> NDArray[np.float32]:
-        smooth = cv2.GaussianBlur(frame.astype(np.float32), (0, 0), _SMOOTH_BLUR)
+    def patches(first: Grey, centres: Array) -> NDArray[np.float32]:
+        smooth = cv2.GaussianBlur(first.astype(np.float32), (0, 0), _SMOOTH_BLUR)
         x, y = centres.T.astype(np.float32)[..., None, None]
         shape = len(centres), len(steps), len(steps)
-        at_x, at_y = (np.broadcast_to(at, shape).reshape(-1, len(steps)) for at in (x + steps, y + steps[:, None]))
+        at_x = np.broadcast_to(x + steps, shape).reshape(-1, len(steps))
+        at_y = np.broadcast_to(y + steps[:, None], shape).reshape(-1, len(steps))
         values = cv2.remap(smooth, at_x, at_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101)
         return np.asarray(values, np.float32).reshape(shape)
 
-    before, after = patches(first, starts), patches(second, ends)
-    mean, here = 0.5 * (before + after), np.s_[:, 1:-1, 1:-1]
-    middle = mean[here]
+    before, after = patches(first, corners), patches(second, ends)
+    mean, inside = 0.5 * (before + after), np.s_[:, 1:-1, 1:-1]
+    middle = mean[inside]
     left, right, above, below = mean[:, 1:-1, :-2], mean[:, 1:-1, 2:], mean[:, :-2, 1:-1], mean[:, 2:, 1:-1]
     by_x, by_y, u, v = 0.5 * (right - left), 0.5 * (below - above), steps[1:-1], steps[1:-1, None]
     mixed = 0.25 * (mean[:, 2:, 2:] - mean[:, 2:, :-2] - mean[:, :-2, 2:] + mean[:, :-2, :-2])
-    left_out = [np.ones_like(by_x), middle, by_x, by_y, u * by_x, u * by_y, v * by_x, v * by_y]
+    nuisance = [np.ones_like(by_x), middle, by_x, by_y, u * by_x, u * by_y, v * by_x, v * by_y]
     by_xx, by_yy = right + left - 2 * middle, below + above - 2 * middle
-    columns = np.stack([*left_out, 0.5 * by_xx, mixed, 0.5 * by_yy, (after - before)[here]], 1)
+    columns = np.stack([*nuisance, 0.5 * by_xx, mixed, 0.5 * by_yy, (after - before)[inside]], 1)
     columns *= np.exp(-np.square([u + 0 * v, v + 0 * u]).sum(0) / _HALF_PATCH**2)  # the root of the window
     flat = columns.reshape(len(columns), columns.shape[1], -1)
-    gram, count = np.asarray(flat @ flat.swapaxes(1, 2), np.float64), len(left_out)
-    inner = gram[:, :count, :count]
+    products, count = np.asarray(flat @ flat.swapaxes(1, 2), np.float64), len(nuisance)
+    inner = products[:, :count, :count]
     inner[:, range(count), range(count)] += 1e-6 * np.trace(inner, axis1=1, axis2=2)[:, None] / count
-    explained = gram[:, count:, :count] @ np.linalg.solve(inner, gram[:, :count, count:])
-    return np.asarray(gram[:, count:, count:] - explained)
+    explained = products[:, count:, :count] @ np.linalg.solve(inner, products[:, :count, count:])
+    return np.asarray(products[:, count:, count:] - explained)

@@ -39,22 +39,22 @@ _SHARE_OF_ALIASING = 1 / 8
 # a camera that aliases, without and with this: two frames 13.3, 12.3; four 21.7, 16.8; eight 12.3, 11.6; roll 10.4,
 # 9.1. Medians decrease by 8 to 19 %. Scenes behind soft optics are not affected
 _LEAST_ALIASED = 1e-3
-# of the mean of all rows. Rows of bars or of a clipped sky have no noise, and what the Wiener filter spreads from their
-# neighbours as detail: without this, 40 black rows of 360 changed amplitudes by 1 %, 13 standard deviations
+# of the mean of all rows. Rows of bars or of a clipped sky have no noise, only detail that the Wiener filter spreads
+# from their neighbours: without this, 40 black rows of 360 changed amplitudes by 1 %, 13 standard deviations
 _LEAST_VARIANCE = 0.01
 _NOISE_STEP = 4  # along the rows, every fourth frequency gives the noise power
 
 
 @dataclass(frozen=True, eq=False)
 class RowGradients:
-    """Gradients of the scene for the rows of a group of G frames, and their products with the frames' differences."""
+    """Gradients of the scene for the rows of a group of G frames, and their products with differences of the frames."""
 
     # (B, S, A + 1, L) weight times the derivatives of the scene by the A components of the motion, x and y first, and
     # the detail of the scene, less their means
     images: Tensor
     products: Tensor  # (B, S, A + 1, A + 1) float64 sums of their products
-    # (B, S, A + 1, G) float64 sums of their products with the differences of the frames; of two frames (B, S, A + 1,
-    # 1), of the first
+    # (B, S, A + 1, G) float64 sums of their products with the differences of the frames; for two frames (B, S, A + 1,
+    # 1), those of the first
     residual_products: Tensor
     variance: Tensor  # (B, S) float64, noise variance of a pixel in a frame
     # (B, S, 4, 5) float64, sums gx gx, gx gy, gy gy, gx e and gy e over the quarters of each row from left to right,
@@ -87,7 +87,7 @@ def row_gradients(
         warp: Function from a slice of the S rows of the scene to the frames of a group warped to them, (B, G, s, U), as
             ``RowSpectra.warped``. Threads call it.
         runs: Slices of the rows that are warped at a time.
-        shift: (B, G, S) px, displacement along the rows by which each was moved back.
+        shift: (B, G, S) px, displacement along the rows that the warp removes.
         visible: (B, G, S) float64, 1 where a scene row is visible in a frame.
         size: Columns of a frame, and length of the transforms along the rows.
         valid: (B, S, W) bool, pixels of the scene that are valid in all frames; None for all.
@@ -101,22 +101,22 @@ def row_gradients(
     parts = chunks(count, 4 * length * batch * (4 + frames), visible.device, multiple=BLOCK)
     regressors = 3 if factors is None else 1 + factors(slice(0, 1)).shape[-1]
     images_of_row = regressors + (1 if frames == 2 else frames)
-    memory: dict[int, Tensor] = {}  # of each thread, used again
+    memory: dict[int, Tensor] = {}  # of each thread, used for all its parts
 
     def pixels(part: slice) -> _Rows:
-        of_scene, part_visible = detail[:, part].contiguous(), visible[:, :, part]
+        scene_detail, part_visible = detail[:, part].contiguous(), visible[:, :, part]
         if get_ident() not in memory:
             memory[get_ident()] = inner.new_empty(batch, parts[0].stop, images_of_row, length)
-        planes = memory[get_ident()][:, : of_scene.shape[1]]
+        planes = memory[get_ident()][:, : scene_detail.shape[1]]
         planes[:, :, 0], planes[:, :, 1] = (
-            torch.fft.irfft(one, n=length) for one in (of_scene * along, across[:, part])
+            torch.fft.irfft(spectrum, n=length) for spectrum in (scene_detail * along, across[:, part])
         )
         if factors is not None:
-            moved = factors(part).to(planes.dtype)
-            by_component = moved[..., 0, :] * planes[:, :, 0, :, None] + moved[..., 1, :] * planes[:, :, 1, :, None]
+            by_unit = factors(part).to(planes.dtype)
+            by_component = by_unit[..., 0, :] * planes[:, :, 0, :, None] + by_unit[..., 1, :] * planes[:, :, 1, :, None]
             planes[:, :, : regressors - 1] = by_component.movedim(-1, 2)
-        for place, one in enumerate((of_scene, *different[:, :, part].unbind(1)), regressors - 1):
-            planes[:, :, place] = torch.fft.irfft(one, n=length)
+        for place, spectrum in enumerate((scene_detail, *different[:, :, part].unbind(1)), regressors - 1):
+            planes[:, :, place] = torch.fft.irfft(spectrum, n=length)
         weight = inner * (part_visible.sum(1) > 1)[..., None].to(inner.dtype)
         if valid is not None:
             weight = weight * functional.pad(valid[:, part], (0, length - width))
@@ -129,24 +129,24 @@ def row_gradients(
     block_weight = _block_weight(*(torch.cat(values, 1) for values in zip(*blocks, strict=True)))
     within = [slice(part.start // BLOCK, -(-part.stop // BLOCK)) for part in parts]
     lost = (block_weight < 1).any(-1).any(0).tolist()
-    reweighted = [place for place in range(len(parts)) if any(lost[within[place]])]
+    reweighted_places = [place for place in range(len(parts)) if any(lost[within[place]])]
 
     def fit_again(place: int) -> tuple[Tensor, ...]:
-        some = pixels(parts[place])
+        rows = pixels(parts[place])
         spread = block_weight[:, within[place]].repeat_interleave(BLOCK, 1).repeat_interleave(BLOCK, 2)
-        weight = some.weight * spread[:, : some.weight.shape[1], :length]
-        return _fit_rows(replace(some, weight=weight), edges, images[:, parts[place]])[0]
+        weight = rows.weight * spread[:, : rows.weight.shape[1], :length]
+        return _fit_rows(replace(rows, weight=weight), edges, images[:, parts[place]])[0]
 
-    for place, fit in zip(reweighted, in_parallel(fit_again, reweighted, visible.device), strict=True):
+    for place, fit in zip(reweighted_places, in_parallel(fit_again, reweighted_places, visible.device), strict=True):
         fits[place] = fit
     sums, solution, square = (torch.cat(values, 1) for values in zip(*fits, strict=True))
-    products, right = _products(sums.sum(2))
+    products, right_side = _products(sums.sum(2))
     means = _means(products)
     variance = square / (products[..., -1, -1] - regressors - 1).clamp(min=1.0)
     return RowGradients(
         images,
         products=products[..., :-1, :-1] - means * products[..., -1:, :-1],
-        residual_products=right[..., :-1, :] - means * right[..., -1:, :],
+        residual_products=right_side[..., :-1, :] - means * right_side[..., -1:, :],
         variance=variance.maximum(_LEAST_VARIANCE * variance.mean(-1, keepdim=True)),
         quarters=_quarters(sums, solution, visible),
         aliasing=aliasing,
@@ -178,20 +178,20 @@ def row_equations(products: Tensor, gradients: RowGradients, visible: Tensor) ->
         relative to the mean over the group, and H its information matrix in one frame. Both are 0 for rows that are
         visible in fewer than two frames or have no detail.
     """
-    right = -(torch.cat([products, -products], -1) if visible.shape[1] == 2 else products).permute(0, 3, 1, 2)
-    of_scene = gradients.products
-    detail = of_scene[..., -1, -1]
+    target = -(torch.cat([products, -products], -1) if visible.shape[1] == 2 else products).permute(0, 3, 1, 2)
+    scene = gradients.products
+    detail = scene[..., -1, -1]
     safe = detail.clamp(min=1e-300)
     usable = (detail > 0) & (gradients.variance > 0)
-    matrix = of_scene[..., :-1, :-1] - of_scene[..., :-1, -1:] * of_scene[..., -1:, :-1] / safe[..., None, None]
-    right = right[..., :-1] - of_scene[:, None, :, :-1, -1] * (right[..., -1:] / safe[:, None, :, None])
+    matrix = scene[..., :-1, :-1] - scene[..., :-1, -1:] * scene[..., -1:, :-1] / safe[..., None, None]
+    target = target[..., :-1] - scene[:, None, :, :-1, -1] * (target[..., -1:] / safe[:, None, :, None])
     factor = torch.where(usable, 1 / torch.where(usable, gradients.variance, 1.0), 0.0)
-    return matrix * factor[..., None, None], right * factor[:, None, :, None]
+    return matrix * factor[..., None, None], target * factor[:, None, :, None]
 
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """Some rows of the scene as pixels."""
+    """Pixels of some rows of the scene."""
 
     planes: Tensor  # (B, s, A + 1 + G, L) derivatives, detail, and the differences of the frames (``differences``)
     weight: Tensor  # (B, s, L) of the pixels
@@ -209,8 +209,8 @@ def _fit_rows(rows: _Rows, edges: list[int], out: Tensor) -> tuple[tuple[Tensor,
     images, residual = rows.planes[:, :, : rows.regressors], rows.planes[:, :, rows.regressors :]
     weighted = torch.mul(images, rows.weight[:, :, None], out=out)
     sums = _sums_of_parts(weighted, rows, edges)
-    products, right = _products(sums.sum(2))
-    solution = _solve(products, right.transpose(-2, -1))
+    products, right_side = _products(sums.sum(2))
+    solution = _solve(products, right_side.transpose(-2, -1))
     factors = solution.to(weighted.dtype)
     fitted = torch.matmul(factors[..., :-1], images).add_(factors[..., -1:])
     energy = torch.sub(residual, fitted, out=fitted).square_().sum(2) * rows.weight
@@ -244,15 +244,15 @@ def _sums_of_parts(weighted: Tensor, rows: _Rows, edges: list[int]) -> Tensor:
         columns = slice(first, end)
         images, weight = weighted[..., columns], rows.weight[..., columns]
         planes = rows.planes[..., columns].transpose(-2, -1)
-        of_part = sums[:, :, part]
-        of_part[..., :count, :-1] = torch.matmul(images, planes)
-        of_part[..., count:, :-1] = torch.matmul(weight[:, :, None], planes)
-        of_part[..., :count, -1] = of_part[..., count, :count]
-        of_part[..., count, -1] = weight.sum(-1)
+        part_sums = sums[:, :, part]
+        part_sums[..., :count, :-1] = torch.matmul(images, planes)
+        part_sums[..., count:, :-1] = torch.matmul(weight[:, :, None], planes)
+        part_sums[..., :count, -1] = part_sums[..., count, :count]
+        part_sums[..., count, -1] = weight.sum(-1)
     return sums
 
 
-def _solve(products: Tensor, right: Tensor) -> Tensor:
+def _solve(products: Tensor, right_side: Tensor) -> Tensor:
     """Coefficients (B, s, G, A + 2) of the fit, with a relative regularisation of 1e-6; 0 for rows without detail."""
     diagonal = products.diagonal(dim1=-2, dim2=-1)
     usable = (diagonal > 0).all(-1)[..., None]
@@ -262,7 +262,7 @@ def _solve(products: Tensor, right: Tensor) -> Tensor:
         products * scale[..., :, None] * scale[..., None, :]
         + torch.where(usable, scale.new_tensor(1e-6), 1.0)[..., None] * eye
     )
-    solution = torch.linalg.solve(unit, (right * scale[..., None, :]).transpose(-2, -1)).transpose(-2, -1)
+    solution = torch.linalg.solve(unit, (right_side * scale[..., None, :]).transpose(-2, -1)).transpose(-2, -1)
     return solution * scale[..., None, :]
 
 
@@ -282,9 +282,9 @@ def _block_weight(energy: Tensor, slope: Tensor, share: Tensor) -> Tensor:
     r > 1, with r the mean square of the residual over ``9 median + (0.15 px)^2 |g|^2``. Over each block, ``energy`` and
     ``slope`` are sums of the squared residual and gradient, ``share`` is that of the weights.
     """
-    used = share > 0
+    is_used = share > 0
     mean, slope = energy / share.clamp(min=1e-6), slope / share.clamp(min=1e-6)
-    typical = torch.where(used, mean, torch.nan).flatten(1).nanmedian(1).values[:, None, None]
+    typical = torch.where(is_used, mean, torch.nan).flatten(1).nanmedian(1).values[:, None, None]
     ratio = mean / (9.0 * typical + 0.15**2 * slope).clamp(min=1e-30)
     return 1 / (1 + (ratio - 1).clamp(min=0.0).square())
 
@@ -293,8 +293,8 @@ def _quarters(sums: Tensor, solution: Tensor, visible: Tensor) -> Tensor:
     """Sums over the parts of each row, as in ``RowGradients.quarters``; the ``solution`` is (B, s, G, A + 2)."""
     count = solution.shape[-1] - 1
     images, ones = solution[:, :, None].transpose(-2, -1).split((count, 1), dim=-2)
-    right = sums[..., :2, count:-1] - sums[..., :2, :count] @ images - sums[..., :2, -1:] @ ones  # (B, s, parts, 2, G)
-    change = right[..., -1] - right[..., 0] if right.shape[-1] > 1 else -2 * right[..., 0]
+    target = sums[..., :2, count:-1] - sums[..., :2, :count] @ images - sums[..., :2, -1:] @ ones  # (B, s, parts, 2, G)
+    change = target[..., -1] - target[..., 0] if target.shape[-1] > 1 else -2 * target[..., 0]
     products = torch.stack([sums[..., 0, 0], sums[..., 0, 1], sums[..., 1, 1]], dim=-1)
     return torch.cat([products, change], dim=-1) * (visible[:, 0] * visible[:, -1])[..., None, None]
 
@@ -325,21 +325,21 @@ def _scene_detail(mean: Tensor, noise: Tensor, length: int) -> tuple[Tensor, Ten
     P is the power spectrum of the mean and N that of its noise, both smoothed over 16 x 16 frequencies. The pass band
     excludes shading (below 1/64 cycles/px) and the frequencies that interpolation attenuates; those that are aliased
     are attenuated. ``length`` is that of the transforms along rows. The result has the spectrum (B, R, U) of the
-    detail, the factors (B, 1, U) in px^-1 that make of it the derivative along the rows, the spectrum (B, R, U) of the
-    derivative across them, and the size of the bias (B,) in px by aliasing. Neighbours in memory belong to one
+    detail, the factors (B, 1, U) in px^-1 that turn it into the derivative along the rows, the spectrum (B, R, U) of
+    the derivative across them, and the size of the bias (B,) in px by aliasing. Neighbours in memory belong to one
     frequency. Both derivatives have the size with which they predict the differences of the frames.
     """
     # 1. Powers. Transforms across rows leave the rows contiguous in memory, and all later loops run along them.
-    whole, noise = (torch.fft.fft(rows, dim=-2).transpose(-2, -1) for rows in (mean, noise))
+    spectrum, noise = (torch.fft.fft(rows, dim=-2).transpose(-2, -1) for rows in (mean, noise))
     u = torch.fft.rfftfreq(length, dtype=torch.float64, device=mean.device)
-    v = torch.fft.fftfreq(whole.shape[-1], dtype=torch.float64, device=mean.device)
-    total, noise_power = _smoothed(whole, _SMOOTH), _smoothed(noise, _SMOOTH // _NOISE_STEP)
+    v = torch.fft.fftfreq(spectrum.shape[-1], dtype=torch.float64, device=mean.device)
+    total, noise_power = _smoothed(spectrum, _SMOOTH), _smoothed(noise, _SMOOTH // _NOISE_STEP)
     x, y = (functional.avg_pool1d(f.abs()[None], _SMOOTH, ceil_mode=True)[0] for f in (u, v))  # means of blocks
     bands = _pass_bands(x, y)
     # 2. The filter.
     wiener = (1 - noise_power / total.clamp(min=torch.finfo(total.dtype).tiny)).clamp(min=0.0)
     filtered = wiener * _with_little_aliasing(total - noise_power, noise_power, x, *bands)
-    torch.view_as_real(whole).mul_(_in_pass_band(filtered, u, v)[..., None])
+    torch.view_as_real(spectrum).mul_(_in_pass_band(filtered, u, v)[..., None])
     # 3. A filter that attenuates frequencies of the scene makes derivatives d too small for least squares: with the
     # true ones g, the sum of ``d g`` is larger than that of ``d^2``.
     passed = filtered * torch.outer(*bands).to(filtered.dtype)
@@ -348,11 +348,11 @@ def _scene_detail(mean: Tensor, noise: Tensor, length: int) -> tuple[Tensor, Ten
         ((products * f).sum((1, 2)) / (squares * f).sum((1, 2)).clamp(min=1e-30)).clamp(min=1.0)[:, None, None]
         for f in (x.square().to(filtered.dtype)[:, None], y.square().to(filtered.dtype))
     )
-    detail = torch.fft.ifft(whole)
-    whole *= (2j * math.pi * v).to(whole.dtype) * larger_y
-    across = torch.fft.ifft(whole)
+    detail = torch.fft.ifft(spectrum)
+    spectrum *= (2j * math.pi * v).to(spectrum.dtype) * larger_y
+    across = torch.fft.ifft(spectrum)
     aliasing = _aliasing_bias(total - noise_power, x, *bands)
-    along = (2j * math.pi * u).to(whole.dtype) * larger_x
+    along = (2j * math.pi * u).to(spectrum.dtype) * larger_x
     return detail.transpose(-2, -1), along, across.transpose(-2, -1), aliasing
 
 
@@ -419,10 +419,10 @@ def _smoothed(spectrum: Tensor, frequencies: int) -> Tensor:
     blocks = []
     for part in chunks(parts.shape[1], 4 * parts.shape[2] * len(parts), parts.device, multiple=frequencies):
         power = parts[:, part].square()
-        whole = power.shape[1] // frequencies * frequencies
-        blocks.append(power[:, :whole].unflatten(1, (-1, frequencies)).mean(2))
-        if whole < power.shape[1]:
-            blocks.append(power[:, whole:].mean(1, keepdim=True))
+        num_whole = power.shape[1] // frequencies * frequencies
+        blocks.append(power[:, :num_whole].unflatten(1, (-1, frequencies)).mean(2))
+        if num_whole < power.shape[1]:
+            blocks.append(power[:, num_whole:].mean(1, keepdim=True))
     return functional.avg_pool1d(torch.cat(blocks, 1), 2 * _SMOOTH, ceil_mode=True)
 
 

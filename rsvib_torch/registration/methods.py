@@ -98,10 +98,10 @@ def fine_offsets(task: BandTask, shift: Tensor, surface: Tensor, valid: Tensor) 
     position, value = subpixel_peak(cut_lags(flat, place, (LAGS - 1, LAGS - 1)))
     fine = (position + place - surface.shape[-1] // 2).flip(-1).unflatten(0, valid.shape)
     offsets = shift + fine
-    good = valid & ~_at_edge(place, flat).unflatten(0, valid.shape) & torch.isfinite(fine).all(-1)
-    good = good & ((offsets - task.start).abs() < task.search).all(-1)
-    quality = torch.where(good, value.unflatten(0, valid.shape).clamp(0.0, 1.0), 0.0)
-    return torch.where(good[..., None], offsets, torch.nan), quality
+    measured = valid & ~_at_edge(place, flat).unflatten(0, valid.shape) & torch.isfinite(fine).all(-1)
+    measured = measured & ((offsets - task.start).abs() < task.search).all(-1)
+    quality = torch.where(measured, value.unflatten(0, valid.shape).clamp(0.0, 1.0), 0.0)
+    return torch.where(measured[..., None], offsets, torch.nan), quality
 
 
 @cache
@@ -133,13 +133,12 @@ def subpixel_peak(surface: Tensor) -> tuple[Tensor, Tensor]:
             for place, size in zip(position.T, (rows, columns), strict=True)
         )
         derivatives = (across @ samples @ along.mT).reshape(count, 9).T
-        value, right, by_columns, down, mixed, _, by_rows = derivatives[:7]
+        value, by_column, by_column2, by_row, mixed, _, by_row2 = derivatives[:7]
         # 2. A step to the maximum, where there is one.
-        determinant = by_rows * by_columns - np.square(mixed)
-        converging = converging & (determinant > 0) & (by_rows < 0)
-        move = np.stack([mixed * right - by_columns * down, mixed * down - by_rows * right], -1)
-        step = np.clip(move / determinant[:, None], -0.5, 0.5)
-        position = np.where(converging[:, None], position + step, position)
+        determinant = by_row2 * by_column2 - np.square(mixed)
+        converging = converging & (determinant > 0) & (by_row2 < 0)
+        move = np.stack([mixed * by_column - by_column2 * by_row, mixed * by_row - by_row2 * by_column], -1)
+        position = np.where(converging[:, None], position + np.clip(move / determinant[:, None], -0.5, 0.5), position)
     converging = converging & (np.abs(position) <= 1.0).all(-1)
     position[~converging] = np.nan
     peaks = tensor(np.column_stack([position, value])).to(surface.device)
@@ -266,9 +265,9 @@ def register_phase(task: BandTask) -> tuple[Tensor, Tensor]:
     fraction = torch.zeros_like(shift, dtype=task.first.dtype)
     template = take_windows(task.first, places[..., 1], places[..., 0], task.height, task.width)
     for _ in range(2):  # the window follows the content: to a whole pixel, then to a fraction
-        shifted = places + shift
-        inside = (shifted[..., 1] >= 0) & (shifted[..., 1] + task.height <= num_rows)
-        window = take_windows(task.second, shifted[..., 1], shifted[..., 0], task.height, task.width)
+        later_places = places + shift
+        inside = (later_places[..., 1] >= 0) & (later_places[..., 1] + task.height <= num_rows)
+        window = take_windows(task.second, later_places[..., 1], later_places[..., 0], task.height, task.width)
         surface = _phase_surface(template, window, fraction)
         offsets, quality = fine_offsets(task, shift, surface, valid & inside)
         best = torch.where(torch.isfinite(offsets), offsets, shift.to(offsets.dtype))
@@ -316,7 +315,7 @@ def _phase_surface(first: Tensor, second: Tensor, fraction: Tensor) -> Tensor:
 def register_projection(task: BandTask) -> tuple[Tensor, Tensor]:
     """Offsets and quality of bands by correlation of profiles, the means of rows and of columns.
 
-    The sum of the correlations along both axes has its peak where each of them has its own.
+    The sum of the correlations along both axes has its peak where both correlations have theirs.
     """
     _, shift, valid = _search(task)
     down, along = (_profile_correlation(task, shift, reach) for reach in ((LAGS, 0), (0, LAGS)))

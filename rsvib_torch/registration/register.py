@@ -159,19 +159,19 @@ def fits_frame(num_rows: int, width: int, options: RegistrationOptions) -> bool:
 
 
 def _needed_size(options: RegistrationOptions) -> tuple[int, int]:
-    """Least rows, and least px in a row."""
+    """Smallest number of rows, and of px in a row."""
     return options.band_rows + 2 * options.search, 4 * (options.search + 8)
 
 
 def check_frame_size(num_rows: int, width: int, options: RegistrationOptions, parts: int = 1) -> None:
-    """Refuse frames that are smaller than a band and its search range, or whose ``parts`` of the columns are."""
+    """Refuse frames that are smaller than a band and its search range, or frames with such ``parts`` of the columns."""
     rows, columns = _needed_size(options)
     if not fits_frame(num_rows, round(width / parts), options):
         more_columns = ", or use more columns" if getattr(options, "columns", None) else ""
-        of_columns = f" in {parts} parts of the columns, for roll, zoom or a lens," if parts > 1 else ""
+        in_parts = f" in {parts} parts of the columns, for roll, zoom or a lens," if parts > 1 else ""
         raise ValueError(
             f"frames of {num_rows} x {width} px (rows in readout order x px per row) are too small for bands of "
-            f"{options.band_rows} rows{of_columns} searched over {options.search} px: at least {rows} x "
+            f"{options.band_rows} rows{in_parts} searched over {options.search} px: at least {rows} x "
             f"{parts * columns} are needed; reduce {'band_rows or ' * (num_rows < rows)}search{more_columns}"
         )
 
@@ -213,12 +213,12 @@ def _bands_of_pairs(
     # a Gaussian of 1 px band-limits the correlation, so that whole-pixel lags determine its peak, and damps noise
     grey = _without_row_means(smoothed(grey, _GAUSSIAN.tolist()))
     first, second = grey[:, :-1].flatten(0, 1), grey[:, 1:].flatten(0, 1)
-    # Pairs at a time: their transforms (2.5 MB each) stay in the cache of a CPU.
+    # Few pairs at a time: their transforms (2.5 MB each) stay in the cache of a CPU.
     parts = chunks(num_frames - 1, batch * 2**21, grey.device)
     coarse = torch.cat([_coarse_offsets(grey[:, pair.start : pair.stop + 1]) for pair in parts], 1).flatten(0, 1)
     bytes_of_pair = len(tops) * (band_rows + 2 * search) * (width + 2 * search) * grey.element_size() * 4
-    # Templates are as wide as the least overlap of pairs that are registered together: pairs of similar overlap are,
-    # so that none affects the others. Pairs that overlap too little are not measured.
+    # Templates are as wide as the least overlap of pairs that are registered together. Pairs of similar overlap are
+    # registered together, so that none affects the others. Pairs that overlap too little are not measured.
     overlap = width - coarse[:, 0].abs() - 2 * template_margin(search)
     coarse = torch.where((overlap < search)[:, None], 0, coarse)
     quarter = 4 * coarse[:, 0].abs() // width
@@ -228,9 +228,9 @@ def _bands_of_pairs(
     for pairs in [part for value in quarter.unique() for part in (quarter == value).nonzero()[:, 0].split(together)]:
         task = BandTask(first[pairs], second[pairs], coarse[pairs], tops, band_rows, search)
         measured, correlation = BAND_METHODS[options.registration](task)
-        good = (correlation > 0.1) & (overlap[pairs, None] >= search)  # chance reaches correlations of 0.1
-        offsets[pairs] = torch.where(good[..., None], measured, torch.nan).double()
-        quality[pairs] = torch.where(good, correlation, 0.0).double()
+        is_measured = (correlation > 0.1) & (overlap[pairs, None] >= search)  # chance reaches correlations of 0.1
+        offsets[pairs] = torch.where(is_measured[..., None], measured, torch.nan).double()
+        quality[pairs] = torch.where(is_measured, correlation, 0.0).double()
         advance(len(correlation))
     shape = (batch, num_frames - 1)
     return offsets.unflatten(0, shape), quality.unflatten(0, shape)
@@ -280,8 +280,7 @@ def _largest_around(surface: Tensor, reach: int) -> Tensor:
     """Largest values of (..., H, W) within ``reach`` along both axes; by ``max_pool2d``, detection takes 6 % more."""
     for dim, ends in ((-1, [reach] * 2), (-2, [0, 0] + [reach] * 2)):
         padded = functional.pad(surface, ends, value=-torch.inf)
-        shifted = [padded.narrow(dim, lag, surface.shape[dim]) for lag in range(2 * reach + 1)]
-        surface = reduce(torch.maximum, shifted)
+        surface = reduce(torch.maximum, [padded.narrow(dim, lag, surface.shape[dim]) for lag in range(2 * reach + 1)])
     return surface
 
 
@@ -289,8 +288,8 @@ def _standardised(images: Tensor) -> Tensor:
     """Images (B, T, H, W) less their mean over 31 x 31 px (light, vignetting, shading), with unit variance."""
     size = min(31, (min(images.shape[-2:]) - 1) // 2 * 2 + 1)
     mean = functional.pad(images, [size // 2] * 4, mode="reflect")
-    for dim, padding in ((-1, (1, 0)), (-2, (0, 0, 1, 0))):  # running sums
-        total = functional.pad(mean.cumsum(dim), padding)
+    for dim, left in ((-1, (1, 0)), (-2, (0, 0, 1, 0))):  # running sums
+        total = functional.pad(mean.cumsum(dim), left)
         count = total.shape[dim] - size
         mean = (total.narrow(dim, size, count) - total.narrow(dim, 0, count)) / size
     detail = images - mean
@@ -309,12 +308,12 @@ def _overlap_correlation(images: Tensor, shift_x: Tensor, shift_y: Tensor) -> Te
     tables = torch.stack([images, images.square()], 2).cumsum(-1).cumsum(-2)
     tables = functional.pad(tables, (1, 0, 1, 0)).flatten(3)  # (B, T, 2, (H + 1) (W + 1))
 
-    def overlap(of: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    def overlap(sum_tables: Tensor, x: Tensor, y: Tensor) -> Tensor:
         """Sums (B, T - 1, 2, C) over the part of images that is still inside after a shift."""
         left, right = (-x).clamp(min=0), (columns - x).clamp(max=columns)
         top, bottom = (-y).clamp(min=0), (rows - y).clamp(max=rows)
         corners = [row * (columns + 1) + column for row in (bottom, top) for column in (right, left)]
-        values = [of.gather(-1, corner[:, :, None].expand(-1, -1, 2, -1)) for corner in corners]
+        values = [sum_tables.gather(-1, corner[:, :, None].expand(-1, -1, 2, -1)) for corner in corners]
         return values[0] - values[1] - values[2] + values[3]
 
     first, second = overlap(tables[:, :-1], shift_x, shift_y), overlap(tables[:, 1:], -shift_x, -shift_y)
@@ -323,5 +322,5 @@ def _overlap_correlation(images: Tensor, shift_x: Tensor, shift_y: Tensor) -> Te
     energy = (first[:, :, 1] - first[:, :, 0].square() / total) * (second[:, :, 1] - second[:, :, 0].square() / total)
     correlation = (product - first[:, :, 0] * second[:, :, 0] / total) * energy.clamp(min=1e-30).rsqrt()
     share = total / (rows * columns)
-    # of two overlaps that correlate equally well the larger one is taken
+    # the larger of two overlaps that correlate equally well is preferred
     return torch.where(share >= 0.3, correlation * share**0.25, -torch.ones_like(correlation))

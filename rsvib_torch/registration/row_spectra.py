@@ -40,7 +40,7 @@ class RowSpectra:
     ) -> None:
         self.height, self.width = frames.shape[-2:]
         self.length = fast_length(self.width + 64)  # 32 px of boundary extension per end close the period smoothly
-        # Frames at a time, so that copies of few need memory, and rows of these at a time, which stay in the cache.
+        # Few frames at a time limit the memory for copies, and few of their rows at a time stay in the cache.
         bytes_of_frame = 4 * frames[:, 0].numel() * frames.element_size()
         level, contrast = (
             torch.as_tensor(x, dtype=frames.dtype, device=frames.device).expand(*frames.shape[:2], 1, 1)
@@ -62,8 +62,7 @@ class RowSpectra:
         self.valid = None
         if valid is not None and not bool(valid.all()):
             # pixels that are interpolated from an invalid one are invalid as well
-            invalid = functional.max_pool2d((~valid).to(frames.dtype), 2 * (DEGREE // 2) + 1, 1, DEGREE // 2)
-            self.valid = invalid == 0
+            self.valid = functional.max_pool2d((~valid).to(frames.dtype), 2 * (DEGREE // 2) + 1, 1, DEGREE // 2) == 0
 
     def _index_rows(self) -> None:
         """Set the table of all rows of all frames (shared by parts) and the index of each frame's first row in it."""
@@ -73,26 +72,26 @@ class RowSpectra:
 
     def part(self, frames: slice) -> "RowSpectra":
         """The spectra of some of the frames."""
-        part = copy(self)
-        part.values, part._first_rows = self.values[:, frames], self._first_rows[:, frames]
-        part.valid = None if self.valid is None else self.valid[:, frames]
-        return part
+        selection = copy(self)
+        selection.values, selection._first_rows = self.values[:, frames], self._first_rows[:, frames]
+        selection.valid = None if self.valid is None else self.valid[:, frames]
+        return selection
 
     def in_groups(self, count: int) -> "RowSpectra":
         """Spectra (B M, G) of ``count`` groups of each stack, see ``overlapping``; ``values`` stay those of frames."""
         if count == 1:
             return self
-        part = copy(self)
-        part._first_rows = overlapping(self._first_rows, count)
-        part.valid = None if self.valid is None else overlapping(self.valid, count)
-        return part
+        grouped = copy(self)
+        grouped._first_rows = overlapping(self._first_rows, count)
+        grouped.valid = None if self.valid is None else overlapping(self.valid, count)
+        return grouped
 
     def _with(self, values: Tensor, valid: Tensor | None) -> "RowSpectra":
         """Other spectra of the same frequencies, with a mask."""
-        other = copy(self)
-        other.values, other.valid = values, valid
-        other._index_rows()
-        return other
+        spectra = copy(self)
+        spectra.values, spectra.valid = values, valid
+        spectra._index_rows()
+        return spectra
 
     def stacks(self, index: Tensor) -> "RowSpectra":
         """The spectra of some of the stacks; the values are copied."""
@@ -100,9 +99,9 @@ class RowSpectra:
 
     def band(self, frequencies: slice) -> "RowSpectra":
         """Some of the frequencies of all frames; the values are copied."""
-        part = self._with(self.values[..., frequencies].contiguous(), self.valid)
-        part.frequencies, part._band = self.frequencies[frequencies], frequencies
-        return part
+        selection = self._with(self.values[..., frequencies].contiguous(), self.valid)
+        selection.frequencies, selection._band = self.frequencies[frequencies], frequencies
+        return selection
 
     def followed_by(self, later: "RowSpectra") -> "RowSpectra":
         """The spectra of these and of later frames of the same size."""
@@ -125,8 +124,8 @@ class RowSpectra:
         index = index.add_(self._first_rows[..., None, None]).flatten(1, 3)
         phases = phase_tables(shift, self.length, self._band, self.values.dtype)
         shape = (*rows.shape[1:], self.values.shape[-1])
-        of_nodes = (values.unbind(0) for values in (index, weights, *phases))
-        for taps, factors, coarse, fine in zip(*of_nodes, strict=True):
+        values_of_nodes = (values.unbind(0) for values in (index, weights, *phases))
+        for taps, factors, coarse, fine in zip(*values_of_nodes, strict=True):
             interpolated = functional.embedding_bag(  # weighted sums of rows of the table
                 taps, self._all_rows, per_sample_weights=factors, mode="sum"
             )
@@ -191,7 +190,7 @@ def mean_over_frames(spectra: Tensor, visible: Tensor) -> Tensor:
 def differences(spectra: Tensor, visible: Tensor) -> Tensor:
     """Differences (B, G, S, U) of the rows of each frame from their mean over the frames in which they are visible.
 
-    Of two frames, only that of the first, (B, 1, S, U), the negative of the other. 0 where a row is not visible.
+    For two frames, only that of the first, (B, 1, S, U), because the other is its negative. 0 for invisible rows.
     """
     if spectra.shape[1] == 2:
         half = 0.5 * visible.prod(1, keepdim=True)
@@ -254,8 +253,8 @@ def column_pattern(groups: list[tuple[RowSpectra, Tensor, Tensor, Tensor, Tensor
     strength = pattern.abs().square() * power / (energy / count.clamp(min=1.0)).clamp(min=1e-30)
     strength = functional.avg_pool1d(functional.pad(strength[:, None], (8, 8), mode="replicate"), 17, 1)[:, 0]
     share = torch.where(strength > 3.0, 1 - 1 / strength.clamp(min=1.0), 0.0)
-    significant: Tensor = pattern * share
+    shrunk: Tensor = pattern * share
     u = groups[0][0].frequencies.to(power.dtype)
     scene = torch.stack([squared_modulus(spectra.values[:, :, ::16]).mean((1, 2)) for spectra, *_ in groups]).mean(0)
-    slopes, of_scene = ((u.square() * values).sum(-1) for values in (squared_modulus(significant), scene))
-    return significant * (slopes > _LEAST_PATTERN * of_scene)[:, None]
+    slopes, scene_slope = ((u.square() * values).sum(-1) for values in (squared_modulus(shrunk), scene))
+    return shrunk * (slopes > _LEAST_PATTERN * scene_slope)[:, None]

@@ -1,7 +1,7 @@
 """Displacements of scene rows, measured in images that are warped by a known motion.
 
 Frames are compared in groups that contain the same part of the scene. The frames of a group are warped to the scene by
-the motion, and blurred alike if their exposures blurred them differently. ``registration.gradients`` then gives the
+the motion, and their blur is equalised if their exposures differ in it. ``registration.gradients`` then gives the
 residual displacement of every scene row in every frame and its information matrix, which are summed over
 ``BLOCK_ROWS`` rows. This is where images become measurements.
 
@@ -116,20 +116,20 @@ def frame_groups(
     starts = timing.frame_starts(count, spectra.values.device).expand(stacks, -1)
     travelled = (motion.drift(starts[:, 1:]) - motion.drift(starts[:, :-1])).abs().amax((0, 1))
     fraction = float((travelled / travelled.new_tensor([spectra.width, spectra.height])).amax())
-    most = int(max(2, min(MAX_GROUP_FRAMES, 1 + (1 - _MIN_OVERLAP) // max(fraction, 1e-9))))
+    max_frames = int(max(2, min(MAX_GROUP_FRAMES, 1 + (1 - _MIN_OVERLAP) // max(fraction, 1e-9))))
     if pairs != "never":
         different, very_different = differently_blurred(starts, spectra.height, timing, motion)
-        most = 2 if bool((different if pairs == "different" else very_different).any()) else most
-    number = max(1, math.ceil((count - 1) / (most - 1)))
+        max_frames = 2 if bool((different if pairs == "different" else very_different).any()) else max_frames
+    num_groups = max(1, math.ceil((count - 1) / (max_frames - 1)))
     # Groups of equal size follow each other, so that they are measured together.
-    steps_of_group, longer = divmod(count - 1, number)
-    parts, first = [], 0
-    for groups, size in ((longer, steps_of_group + 2), (number - longer, steps_of_group + 1)):
+    steps_of_group, longer = divmod(count - 1, num_groups)
+    parts, first_frame = [], 0
+    for groups, size in ((longer, steps_of_group + 2), (num_groups - longer, steps_of_group + 1)):
         bytes_of_group = 4 * stacks * spectra.length * (4 + size) * 4 * BLOCK  # four rows of blocks, ``row_gradients``
-        for part in runs(groups, 1) if one_at_a_time else chunks(groups, bytes_of_group, starts.device):
-            frames = slice(first, first + (part.stop - part.start) * (size - 1) + 1)
-            parts.append(FrameGroups(spectra.part(frames), starts[:, frames], part.stop - part.start))
-            first = frames.stop - 1
+        for batch in runs(groups, 1) if one_at_a_time else chunks(groups, bytes_of_group, starts.device):
+            frames = slice(first_frame, first_frame + (batch.stop - batch.start) * (size - 1) + 1)
+            parts.append(FrameGroups(spectra.part(frames), starts[:, frames], batch.stop - batch.start))
+            first_frame = frames.stop - 1
     return parts
 
 
@@ -163,27 +163,27 @@ def measure_strips(
     group: FrameGroups,
     timing: RowTiming,
     motion: Motion,
-    of_strips: Motion,
+    strip_motion: Motion,
     strips: ColumnStrips,
     factors: Callable[[Tensor, Tensor], Tensor],
     gradients: RowGradients | None = None,
 ) -> tuple["MeasuredGroup", RowGradients]:
     """``measure_group`` for a motion (B) with roll or zoom, from frames (B S) that are cut into S strips of columns.
 
-    Every strip is warped by the motion ``of_strips`` (B S) of its middle. Strips are joined with weights that are
-    linear between middles, which moves the columns between them by the amount between: exactly to first order. Rows of
-    full width then measure all A components of the motion at once. ``factors`` are the displacements (..., 2, A) by
-    unit components at positions x and y in px from the centre.
+    Every strip is warped by the motion ``strip_motion`` (B S) of its middle. Strips are joined with weights that are
+    linear between the middles, which displaces the columns between them by the interpolated amount, to first order.
+    Rows of full width then measure all A components of the motion at once. ``factors`` are the displacements (..., 2,
+    A) by unit components at positions x and y in px from the centre.
     """
     spectra, count = group.spectra, len(strips.firsts)
-    margin = reach_of_blur(spectra.height, timing, of_strips)
-    positions = Positions.of(group.starts, spectra.height, timing, of_strips, margin=margin)
+    margin = reach_of_blur(spectra.height, timing, strip_motion)
+    positions = Positions.of(group.starts, spectra.height, timing, strip_motion, margin=margin)
 
     def over_strips(values: Tensor) -> Tensor:
         return values.unflatten(0, (-1, count))
 
     visible = over_strips(positions.visible(spectra.height, BLOCK_ROWS)).amin(1)
-    warp = warp_to_scene(spectra, positions, timing, of_strips)
+    warp = warp_to_scene(spectra, positions, timing, strip_motion)
     runs_of_rows = spectra.runs(positions.rows.shape[-1], 2)
     length = fast_length(strips.frame_width + 64)
 
@@ -238,9 +238,9 @@ def _measured(
     exposure_starts = _in_blocks(exposure_starts).mean(3)
     # a fit of frames with a wrong timing may place rows at any distance; they are invisible, but their times would make
     # the record, and with it the frequency grid, as long (18 GB)
-    first = group.starts_of_groups[: len(exposure_starts), :, None]
+    frame_starts = group.starts_of_groups[: len(exposure_starts), :, None]
     height_time = group.spectra.height * timing.row_time
-    exposure_starts = exposure_starts.clamp(first - height_time, first + 2 * height_time)
+    exposure_starts = exposure_starts.clamp(frame_starts - height_time, frame_starts + 2 * height_time)
     around = motion.mean_displacement(exposure_starts, timing.exposure_time)
     return MeasuredGroup(
         exposure_starts=_of_stacks(exposure_starts.transpose(1, 2), group.count),
@@ -255,10 +255,10 @@ def _of_stacks(values: Tensor, groups: int) -> Tensor:
     return values.unflatten(0, (-1, groups)).flatten(1, 2)
 
 
-def _solved(information: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
-    """Displacements (B, G, N, A) of blocks and their information (B, N, A, A); 0 with structure along one direction."""
+def _solved(information: Tensor, right_side: Tensor) -> tuple[Tensor, Tensor]:
+    """Displacements (B, G, N, A) of blocks and their information (B, N, A, A); both 0 if rows do not determine them."""
     information = _in_blocks(information[:, None]).sum(3)[:, 0]
-    right = _in_blocks(right).sum(3)
+    right_side = _in_blocks(right_side).sum(3)
     xx, yy = information[..., 0, 0], information[..., 1, 1]
     determinant = xx * yy - information[..., 0, 1].square()
     measured = (determinant > 1e-4 * xx * yy) & (determinant > 0)
@@ -270,7 +270,7 @@ def _solved(information: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
         measured = measured & (torch.linalg.eigvalsh(normal)[..., 0] > 1e-6)  # detail in one place: no roll
     eye = torch.eye(axes, dtype=information.dtype, device=information.device)
     regular = torch.where(measured[..., None, None], information, eye)
-    solution = torch.linalg.solve(regular[:, None], right[..., None])[..., 0]
+    solution = torch.linalg.solve(regular[:, None], right_side[..., None])[..., 0]
     solution = torch.where(measured[:, None, :, None], solution, 0.0)
     return solution, torch.where(measured[..., None, None], information, 0.0)
 
@@ -284,12 +284,12 @@ def _in_blocks(values: Tensor) -> Tensor:
 def joined_groups(parts: list[MeasuredGroup], exposure_time: float, groups: int = 1) -> Measurements:
     """Measurements of all groups as one record; smaller groups get frames in which no row is visible."""
     arrays = tables(*(value for part in parts for value in vars(part).values()))
-    starts, displacements, visible, information = (arrays[first::4] for first in range(4))
-    most = max(part.shape[2] for part in starts)
+    starts, displacements, visible, information = (arrays[number::4] for number in range(4))
+    size = max(part.shape[2] for part in starts)
 
     def joined(values: list[Array], mode: Literal["constant", "edge"] = "constant") -> Array:
         padded = [
-            np.pad(part, [(0, 0), (0, 0), (0, most - part.shape[2]), (0, 0)][: part.ndim], mode=mode) for part in values
+            np.pad(part, [(0, 0), (0, 0), (0, size - part.shape[2]), (0, 0)][: part.ndim], mode=mode) for part in values
         ]
         return np.concatenate(padded, 1)
 
@@ -308,23 +308,22 @@ def column_pattern_of(groups: list[FrameGroups], timing: RowTiming, motion: Moti
     """``column_pattern`` of every fourth row of all groups, whose rows have residual variances (B, M, S)."""
     parts = []
     ends = np.cumsum([group.count for group in groups])[:-1]
-    for group, of_group in zip(groups, np.split(row_variance[..., ::EVERY], ends, 1), strict=True):
-        height, of_groups = group.spectra.height, group.motion_of_groups(motion)
-        positions = Positions.of(group.starts_of_groups, height, timing, of_groups, EVERY)
+    for group, group_variance in zip(groups, np.split(row_variance[..., ::EVERY], ends, 1), strict=True):
+        height, group_motion = group.spectra.height, group.motion_of_groups(motion)
+        positions = Positions.of(group.starts_of_groups, height, timing, group_motion, EVERY)
         visible = positions.visible(height, BLOCK_ROWS // EVERY)
-        variance = tensor(of_group).flatten(0, 1).to(visible.device)
-        spectra = group.spectra.in_groups(group.count)
-        parts.append((spectra, positions.rows, positions.shift, visible, variance))
+        variance = tensor(group_variance).flatten(0, 1).to(visible.device)
+        parts.append((group.spectra.in_groups(group.count), positions.rows, positions.shift, visible, variance))
     return column_pattern(parts)
 
 
-SUMMED_ROWS = 64  # rows of a sum from which the displacements of parts of the rows are found
+SUMMED_ROWS = 64  # rows of a sum from which the displacements of parts of the rows are computed
 
 
 def differential_motion(gradients: list[RowGradients], stacks: int, *, uniform: bool = True) -> Array:
     """(B, 2) px, rms difference of the displacements of the halves of the rows, by rotation or parallax; no noise.
 
-    Without a ``uniform`` difference, which all rows have in common: a slow roll causes one.
+    ``uniform``: whether to include the part that all rows have in common, which a slow roll also causes.
     """
     return _rms_of_contrasts(gradients, stacks, [[-1.0, 1.0]], uniform=uniform)
 
@@ -336,35 +335,35 @@ def uneven_motion(gradients: list[RowGradients], stacks: int) -> Array:
 
 
 def _rms_of_contrasts(
-    gradients: list[RowGradients], stacks: int, weights: list[list[float]], *, uniform: bool = True
+    gradients: list[RowGradients], stacks: int, part_weights: list[list[float]], *, uniform: bool = True
 ) -> Array:
     """(B, 2) px, root of the trimmed mean of the sum of squared contrasts between the parts of the rows; without noise.
 
-    The gradients are those of all groups of B ``stacks``. The weights of each contrast are those of the parts. Noise
-    also scatters the mean, of which two standard deviations are subtracted: of 48 axes of pairs of 192 rows with noise
-    of 0.025, 11 seemed to roll.
+    The gradients are those of all groups of B ``stacks``. A contrast is a sum of the parts with ``part_weights``. Noise
+    also scatters the mean, and two standard deviations are subtracted: without that, of 48 axes of pairs of 192 rows
+    with noise of 0.025, 11 seemed to roll.
     """
-    of_groups = []
-    for of_group in gradients:
-        residual, noise, regular = displacements_of_parts(of_group, len(weights[0]))
-        contrasts = residual.new_tensor(weights)
-        variance, values = contrasts.square() @ noise, contrasts @ residual
-        if not uniform and values.shape[1] > 2:  # roll within the frame looks uniform in fewer sums of rows
-            values = values - values.where(regular[..., None, None], torch.nan).nanmedian(1, keepdim=True).values
-        excess = (values.square() - variance).sum(2)
-        both = torch.cat([excess, 2 * variance.square().sum(2)], -1)  # and the variance of the excess
-        both = torch.where(regular[..., None], both, torch.nan)
-        of_groups.append(_of_stacks(both, len(both) // stacks))
-    both_of_blocks = table(torch.cat(of_groups, 1))
-    excess_of_stacks, variance_of_stacks = np.split(trimmed_mean(both_of_blocks), 2, -1)
-    count = np.maximum((~np.isnan(both_of_blocks[..., :2])).sum(1), 1)
-    return np.sqrt(np.maximum(excess_of_stacks - 2 * np.sqrt(variance_of_stacks / count), 0.0))
+    estimates = []
+    for group_gradients in gradients:
+        residual, noise, regular = displacements_of_parts(group_gradients, len(part_weights[0]))
+        contrast_weights = residual.new_tensor(part_weights)
+        variance, contrast = contrast_weights.square() @ noise, contrast_weights @ residual
+        if not uniform and contrast.shape[1] > 2:  # roll within the frame looks uniform in fewer sums of rows
+            contrast = contrast - contrast.where(regular[..., None, None], torch.nan).nanmedian(1, keepdim=True).values
+        excess = (contrast.square() - variance).sum(2)
+        values = torch.cat([excess, 2 * variance.square().sum(2)], -1)  # and the variance of the excess
+        values = torch.where(regular[..., None], values, torch.nan)
+        estimates.append(_of_stacks(values, len(values) // stacks))
+    blocks = table(torch.cat(estimates, 1))
+    mean_excess, mean_variance = np.split(trimmed_mean(blocks), 2, -1)
+    count = np.maximum((~np.isnan(blocks[..., :2])).sum(1), 1)
+    return np.sqrt(np.maximum(mean_excess - 2 * np.sqrt(mean_variance / count), 0.0))
 
 
 def displacements_of_parts(gradients: RowGradients, parts: int = 4) -> tuple[Tensor, Tensor, Tensor]:
     """Displacements (B, N, parts, 2) in px of parts of the rows from first to last frame, from sums over 64 rows.
 
-    Also the variance of their noise, and (B, N) whether all parts have structure along both directions.
+    The other results are the variance of their noise, and (B, N) whether all parts have structure along both axes.
     """
     sums, rows = gradients.quarters.unflatten(2, (parts, -1)).sum(3), SUMMED_ROWS
     count = sums.shape[1] // rows * rows
@@ -402,19 +401,19 @@ def blur_ratio(groups: list[FrameGroups], timing: RowTiming, motion: Motion) -> 
     Returns:
         (B, 3): ratio, its standard deviation, and the size of the expected difference relative to m.
     """
-    of_groups = (_products_of_blur(group, timing, group.motion_of_groups(motion)) for group in groups)
-    parts, counts, moments_of_groups = zip(*of_groups, strict=True)
+    group_sums = (_products_of_blur(group, timing, group.motion_of_groups(motion)) for group in groups)
+    parts, counts, moments_of_groups = zip(*group_sums, strict=True)
     # Least squares. The variance is that of the residuals, 8/3 of it because values share blocks, or by the scatter
     # of the scores of parts if that is larger: errors of interpolation are alike in neighbouring rows.
     products, count = torch.cat(parts, 1), torch.stack(counts).sum(0).clamp(min=1.0)  # (B, M, 3, 3) of M parts
     total = products.sum(1)
-    normal, right, square = total[:, :2, :2], total[:, :2, 2], total[:, 2, 2]
+    normal, right_side, square = total[:, :2, :2], total[:, :2, 2], total[:, 2, 2]
     scale = normal.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).sqrt()
     outer = scale[:, :, None] * scale[:, None]
     inverse = torch.linalg.inv(normal / outer + 1e-9 * torch.eye(2, dtype=torch.float32, device="cpu").to(normal))
     inverse = inverse / outer
-    solution = (inverse @ right[..., None])[..., 0]
-    variance = 8 / 3 * inverse[:, 0, 0] * (square - (solution * right).sum(-1)).clamp(min=0.0) / count
+    solution = (inverse @ right_side[..., None])[..., 0]
+    variance = 8 / 3 * inverse[:, 0, 0] * (square - (solution * right_side).sum(-1)).clamp(min=0.0) / count
     scores = products[:, :, :2, 2] - (products[:, :, :2, :2] @ solution[:, None, :, None])[..., 0]
     scatter = (scores @ inverse[:, 0, :, None]).square().sum((1, 2))
     ratio, size = solution[:, 0], scale[:, 0] / scale[:, 1]
@@ -426,8 +425,8 @@ def blur_ratio(groups: list[FrameGroups], timing: RowTiming, motion: Motion) -> 
 def _products_of_blur(group: FrameGroups, timing: RowTiming, motion: Motion) -> tuple[Tensor, Tensor, Tensor]:
     """Sums (B, M, 3, 3) over M parts of the products of expected difference, mean and measured difference of frames.
 
-    The motion is that of each group. Also the number of independent values, and the largest second moment in px^2,
-    (B,) each.
+    The motion is that of each group. The other results are the number of independent values, and the largest second
+    moment in px^2, (B,) each.
     """
     block = 2
     # 1. Coarse detail of the warped frames, and the second moments of the paths.
@@ -438,40 +437,40 @@ def _products_of_blur(group: FrameGroups, timing: RowTiming, motion: Motion) -> 
 
     def averaged(values: Tensor) -> Tensor:
         rows = values.shape[2] // block
-        of_blocks: Tensor = values[:, :, : rows * block].unflatten(2, (rows, block)).mean(3)
-        return 0.5 * of_blocks[:, :, 1:-1] + 0.25 * (of_blocks[:, :, :-2] + of_blocks[:, :, 2:])
+        blocks: Tensor = values[:, :, : rows * block].unflatten(2, (rows, block)).mean(3)
+        return 0.5 * blocks[:, :, 1:-1] + 0.25 * (blocks[:, :, :-2] + blocks[:, :, 2:])
 
     spectra = averaged(low_spectra.warped(positions.rows, positions.shift))
     second = averaged(moments(*exposure_paths(positions.exposure_starts, timing, motion), 2))
     visible = averaged(positions.visible(group.spectra.height, BLOCK_ROWS))
-    both = (visible[:, 1:] * visible[:, :-1] == 1).double()
+    in_both = (visible[:, 1:] * visible[:, :-1] == 1).double()
     mean, difference = 0.5 * (spectra[:, 1:] + spectra[:, :-1]), spectra[:, 1:] - spectra[:, :-1]
-    weight = both.unfold(2, 5, 1).amin(-1)
+    weight = in_both.unfold(2, 5, 1).amin(-1)
 
     # 2. The expected difference. Derivatives across rows are of fourth order, from two neighbours on each side.
     rows = mean.shape[2] - 4
-    above_2, above, here, below, below_2 = (mean.narrow(2, row, rows) for row in range(5))
+    above_2, above, centre, below, below_2 = (mean.narrow(2, row, rows) for row in range(5))
     by_x = (2j * math.pi * u[low]).to(mean.dtype)
     by_y = 8 / 12 * (below - above) - 1 / 12 * (below_2 - above_2)
-    by_yy = 16 / 12 * (below + above) - 1 / 12 * (below_2 + above_2) - 30 / 12 * here
+    by_yy = 16 / 12 * (below + above) - 1 / 12 * (below_2 + above_2) - 30 / 12 * centre
     change = (0.5 * (second[:, 1:] - second[:, :-1]))[:, :, 2:-2, None].to(by_x.dtype)
-    expected = (change[..., 0, 0] * by_x.square()) * here
+    expected = (change[..., 0, 0] * by_x.square()) * centre
     expected += (2 * change[..., 0, 1] / block * by_x) * by_y
     expected += (change[..., 1, 1] / block**2) * by_yy
 
     # 3. Its products with the mean and with the measured difference, in the columns that all frames contain: beyond
     # them, frames continue without detail, which seemed to be a blur of up to 0.02 of the detail.
-    several = torch.stack([expected, here, difference[:, :, 2:-2]], -2)
+    images = torch.stack([expected, centre, difference[:, :, 2:-2]], -2)
     samples = 2 * low.stop
     place = torch.arange(samples, device=u.device) * group.spectra.length // samples
     inner = inner_columns(group.spectra.width, positions.shift, u)
     inner = functional.pad(inner, (0, group.spectra.length - group.spectra.width))[..., place]
-    values = torch.fft.irfft(functional.pad(several, (low.start, 1)), n=samples, norm="ortho")
+    values = torch.fft.irfft(functional.pad(images, (low.start, 1)), n=samples, norm="ortho")
     values = values * inner[:, :, None, None].to(values.dtype)
-    of_rows = (values @ values.mT).double()  # (B M, G - 1, S, 3, 3)
-    of_groups = of_rows, weight, inner.mean(-1), second.abs().amax((2, 3, 4))
-    of_rows, weight, share, moment = (_of_stacks(part, group.count) for part in of_groups)
-    of_rows *= weight[..., None, None]
-    length = min(_SCATTER_ROWS // block, of_rows.shape[2])
-    of_parts = of_rows[:, :, : of_rows.shape[2] // length * length].unflatten(2, (-1, length)).sum(3)
-    return of_parts.flatten(1, 2), 2 * several.shape[-1] * share.mean(1) * weight.sum((1, 2)), moment.amax(1)
+    row_products = (values @ values.mT).double()  # (B M, G - 1, S, 3, 3)
+    sums = row_products, weight, inner.mean(-1), second.abs().amax((2, 3, 4))
+    row_products, weight, share, moment = (_of_stacks(values, group.count) for values in sums)
+    row_products *= weight[..., None, None]
+    length = min(_SCATTER_ROWS // block, row_products.shape[2])
+    part_products = row_products[:, :, : row_products.shape[2] // length * length].unflatten(2, (-1, length)).sum(3)
+    return part_products.flatten(1, 2), 2 * images.shape[-1] * share.mean(1) * weight.sum((1, 2)), moment.amax(1)

@@ -1,4 +1,4 @@
-"""Rows of frames as they are measured for a fit: as a whole, or in strips of columns for roll and zoom.
+"""Measurement of the rows of grouped frames for a fit: of whole rows, or of strips of columns for roll and zoom.
 
 Invariant: the displacement depends on the row only (docs/architecture.md), in each strip.
 """
@@ -47,7 +47,7 @@ class MeasuredRows:
     gradients: list[RowGradients]  # gradients of the scene, for further rounds
     # (B, N, 2) px^2, mean square difference of the displacements of strips from these components, less that by noise;
     # None if rows were measured as a whole
-    excess: Array | None = None
+    strip_variance: Array | None = None
 
     @property
     def num_stacks(self) -> int:
@@ -58,20 +58,20 @@ class MeasuredRows:
         """The measurements of some stacks."""
         gradients = []
         for part in self.gradients:
-            of_groups = np.arange(len(part.variance)).reshape(self.num_stacks, -1)[stacks].ravel()
-            gradients.append(part.stacks(tensor(of_groups).to(part.variance.device)))
-        excess = None if self.excess is None else self.excess[stacks]
-        return MeasuredRows(take_stacks([self.measurements], stacks), gradients, excess)
+            group_indices = np.arange(len(part.variance)).reshape(self.num_stacks, -1)[stacks].ravel()
+            gradients.append(part.stacks(tensor(group_indices).to(part.variance.device)))
+        strip_variance = None if self.strip_variance is None else self.strip_variance[stacks]
+        return MeasuredRows(take_stacks([self.measurements], stacks), gradients, strip_variance)
 
     def differential(self) -> Array:
         """(B, 2) px, rms difference of the displacements along a row that the components do not explain."""
-        if self.excess is None:
+        if self.strip_variance is None:
             return differential_motion(self.gradients, self.num_stacks)
-        return np.sqrt(np.maximum(trimmed_mean(self.excess), 0.0))
+        return np.sqrt(np.maximum(trimmed_mean(self.strip_variance), 0.0))
 
     def uneven(self) -> Array:
         """(B, 2) px, the part of the differences along a row that roll and zoom cannot explain."""
-        if self.excess is None:
+        if self.strip_variance is None:
             return uneven_motion(self.gradients, self.num_stacks)
         return self.differential()
 
@@ -98,24 +98,24 @@ class GroupedFrames:
         self, motion: Vibration | FreeMotion, gradients: list[RowGradients] | None = None, *, keep_images: bool = True
     ) -> MeasuredRows:
         """All groups measured around a motion, as one record; ``keep_images`` for further rounds."""
-        known = [None] * len(self.groups) if gradients is None else gradients
+        start_gradients = [None] * len(self.groups) if gradients is None else gradients
         count, view = sum(group.count for group in self.groups), self.view(motion)
-        parts, of_groups, advance = [], [], steps(count, self.unit)
-        for group, of_group in zip(self.groups, known, strict=True):
-            part, of_part = self.measure_group(group, motion, view, of_group)
-            parts.append(part)
-            of_groups.append(of_part if keep_images else of_part.without_images())
+        parts, scene, advance = [], list[RowGradients](), steps(count, self.unit)
+        for group, known_gradients in zip(self.groups, start_gradients, strict=True):
+            measured, group_gradients = self.measure_group(group, motion, view, known_gradients)
+            parts.append(measured)
+            scene.append(group_gradients if keep_images else group_gradients.without_images())
             advance(group.count)
-        return MeasuredRows(joined_groups(parts, self.timing.exposure_time, count), of_groups, self.excess(of_groups))
+        return MeasuredRows(joined_groups(parts, self.timing.exposure_time, count), scene, self.strip_variance(scene))
 
     def measure_group(
         self, group: FrameGroups, motion: Motion, view: Motion, gradients: RowGradients | None
     ) -> tuple[MeasuredGroup, RowGradients]:
-        """``displacements.measure_group`` around a motion, which the measured stacks have the ``view`` of."""
+        """``displacements.measure_group`` around a motion, of which ``view`` is the motion of the measured stacks."""
         return measure_group(group, self.timing, view, gradients)
 
-    def excess(self, gradients: list[RowGradients]) -> Array | None:
-        """``MeasuredRows.excess``."""
+    def strip_variance(self, gradients: list[RowGradients]) -> Array | None:
+        """``MeasuredRows.strip_variance``."""
         return None
 
     def view(self, motion: Vibration | FreeMotion) -> Motion:
@@ -146,17 +146,17 @@ class GroupedFrames:
     def differently_blurred(self, motion: Vibration) -> Array:
         """Whether the frames of any group of each stack are blurred differently, (B,) bool, as in ``warping``."""
         view, height = self.view(motion), self.groups[0].spectra.height
-        different = [
+        different = (
             differently_blurred(group.starts_of_groups, height, self.timing, group.motion_of_groups(view))[0]
             for group in self.groups
-        ]
+        )
         return table(torch.cat([part.unflatten(0, (len(motion.amplitude), -1)) for part in different], 1).any(1))
 
 
 def grouped_frames(
     frames: Tensor, valid: Tensor | None, timing: RowTiming, motion: Vibration | FreeMotion
 ) -> GroupedFrames:
-    """Frames (B, T, H, W) in groups for a motion of two components, of which a first estimate is given.
+    """Frames (B, T, H, W) in groups for a first estimate of a motion of two components.
 
     Pairs, whose blur can be equalised, are enough for tones; a free motion needs all frames that contain a row.
     """
@@ -206,12 +206,12 @@ class GroupedStrips(GroupedFrames):
         """Components (B, N, G, A) of the motion of the rows of a group."""
         return measure_strips(group, self.timing, motion, view, self.strips, self.scale.factors, gradients)
 
-    def excess(self, gradients: list[RowGradients]) -> Array:
-        """``MeasuredRows.excess``."""
+    def strip_variance(self, gradients: list[RowGradients]) -> Array:
+        """``MeasuredRows.strip_variance``."""
         excesses = []
-        for of_group in gradients:
-            residual, noise, regular = displacements_of_parts(of_group)
-            share = 1 - 0.5 * self.scale.axes / residual.shape[2]  # the fit of the components takes part of both
+        for group_gradients in gradients:
+            residual, noise, regular = displacements_of_parts(group_gradients)
+            share = 1 - 0.5 * self.scale.axes / residual.shape[2]  # the fit of the components reduces both
             excess = 0.5 * (residual.square() - share * noise).mean(2) / share
             excesses.append(torch.where(regular[..., None], excess, torch.nan))
         return table(torch.cat(excesses, 1))
@@ -242,14 +242,13 @@ class GroupedStrips(GroupedFrames):
         """(B, 3), the weighted mean over every second strip: they contain all columns.
 
         A displacement that changes within a strip acts like blur: with a focal length of 400 px and 5 px, where the
-        ends of strips slide by 0.3 px, the ratio was 0 instead of 1. Its size, which counts as evidence, is then 0.
+        ends of strips slide by 0.3 px, the ratio was 0 instead of 1. Its size is then set to 0, so that it is ignored.
         """
         place = torch.arange(len(self.groups[0].starts), device=self.columns.device)
         index = place[place % len(self.columns) % 2 == 0]
-        groups = [group.stacks(index) for group in self.groups]
-        every_second = replace(self, groups=groups, columns=self.columns[::2])
-        of_strips = GroupedFrames.blur_ratio(every_second, motion)
-        ratio, std, size = of_strips.unflatten(0, (-1, len(every_second.columns))).unbind(-1)
+        every_second = replace(self, groups=[group.stacks(index) for group in self.groups], columns=self.columns[::2])
+        strip_ratios = GroupedFrames.blur_ratio(every_second, motion)
+        ratio, std, size = strip_ratios.unflatten(0, (-1, len(every_second.columns))).unbind(-1)
         weight = torch.where(std > 0, std.square().reciprocal(), 0.0)
         total = weight.sum(1).clamp(min=1e-300)
         size = size.mean(1) if self.slide < _MAX_SLIDE_OF_BLUR else torch.zeros_like(total)
@@ -269,10 +268,10 @@ def grouped_strips(
     field, count = _in_rad(motion, scale), frames.shape[1]
     starts = timing.row_starts(count, scale.height, frames.device)[:, :: max(1, scale.height // 64)].flatten()
     ends = 0.5 * scale.width * torch.tensor([-1.0, 1.0], dtype=torch.float64, device=frames.device)
-    of_ends = ColumnMotion.of_columns(field, ends, timing, count, scale.height)
-    times = starts.expand(*of_ends.batch_shape, -1)
-    along = of_ends.mean_displacement(times, timing.exposure_time)[..., 0] - of_ends.drift(times)[..., 0]
-    margin = math.ceil(float(along.abs().amax()) + 1.0) + MARGIN  # 1 px: whole pixels of an image motion
+    end_motion = ColumnMotion.of_columns(field, ends, timing, count, scale.height)
+    times = starts.expand(*end_motion.batch_shape, -1)
+    at_ends = end_motion.mean_displacement(times, timing.exposure_time)[..., 0] - end_motion.drift(times)[..., 0]
+    margin = math.ceil(float(at_ends.abs().amax()) + 1.0) + MARGIN  # 1 px: whole pixels of an image motion
     slope = _slope(field, scale, starts)
     strips = ColumnStrips.of(scale.width, _pitch(slope), margin, at_ends=True)
     spectra = stack_spectra(frames, valid, strips)

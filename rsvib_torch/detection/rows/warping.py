@@ -1,4 +1,4 @@
-"""Frames of a group warped to the rows of the scene by a motion, and blurred alike.
+"""Frames of a group warped to the rows of the scene by a motion, with equal blur.
 
 Exposures blur the frames of a group differently, which displaces fine detail by more or less than the mean displacement
 of the row. Blurs that differ little are equalised by derivatives of the images, others in pairs of frames by the path
@@ -26,12 +26,12 @@ from rsvib_torch.registration.row_spectra import MARGIN, RowSpectra
 
 @dataclass(frozen=True, eq=False)
 class Positions:
-    """Where the frames of a group contain scene rows."""
+    """Rows of the frames of a group that contain the scene rows."""
 
     scene_rows: Tensor  # (B, 1, S) scene rows s
-    columns: Tensor  # (B, 1, 1) px, displacement along the rows that is common to the group and is not taken out
+    columns: Tensor  # (B, 1, 1) px, displacement along the rows that all frames of the group keep
     rows: Tensor  # (B, G, S) frame rows that contain the scene rows
-    shift: Tensor  # (B, G, S) px, displacement along the rows to be taken out
+    shift: Tensor  # (B, G, S) px, displacement along the rows that the warp removes
     exposure_starts: Tensor  # (B, G, S) s, exposure starts of the frame rows
     beyond: Tensor  # (2, B, G, S + 2 M) rows and shift, also of M scene rows before the first and behind the last one
 
@@ -45,8 +45,8 @@ class Positions:
         middle = starts.mean(-1, keepdim=True) + 0.5 * height * timing.row_time
         travelled = motion.drift(middle).round()[:, :, None]  # (B, 1, 1, 2)
         scene_rows, columns = rows - travelled[..., 1], travelled[..., 0]
-        of_rows, displacement = rows_showing(scene_rows, starts[..., None], timing, motion)
-        beyond = torch.stack([of_rows, displacement[..., 0] - columns])
+        frame_rows, displacement = rows_showing(scene_rows, starts[..., None], timing, motion)
+        beyond = torch.stack([frame_rows, displacement[..., 0] - columns])
         inner = slice(margin, len(rows) - margin)
         rows, shift = beyond[..., inner].unbind()
         begin = torch.add(starts[..., None], rows, alpha=timing.row_time)
@@ -56,8 +56,8 @@ class Positions:
         """(B, G, S) float64, 1 for blocks of scene rows that lie inside a frame of ``height`` rows, else 0."""
         blocks = self.rows.shape[-1] // block
         inside = ((self.rows >= MARGIN) & (self.rows <= height - 1 - MARGIN)).double()
-        whole = inside[..., : blocks * block].unflatten(-1, (blocks, block)).amin(-1)
-        return functional.pad(whole.repeat_interleave(block, dim=-1), (0, self.rows.shape[-1] - blocks * block))
+        inside_blocks = inside[..., : blocks * block].unflatten(-1, (blocks, block)).amin(-1)
+        return functional.pad(inside_blocks.repeat_interleave(block, dim=-1), (0, self.rows.shape[-1] - blocks * block))
 
 
 # Blur of exposures
@@ -90,7 +90,7 @@ _NEARLY_EQUAL = (math.inf, 0.1, 0.008)
 
 
 def differently_blurred(starts: Tensor, height: int, timing: RowTiming, motion: Motion) -> tuple[Tensor, Tensor]:
-    """(B,) bool each, whether frames from ``starts`` (B, G) on are blurred differently, and only pairs equalise it."""
+    """(B,) bool each: frames from ``starts`` (B, G) on are blurred differently; so much that only pairs equalise it."""
     rows = torch.arange(0, height, 8, dtype=torch.float64, device=starts.device)
     return _differences(*exposure_paths(starts[..., None] + rows * timing.row_time, timing, motion))
 
@@ -100,7 +100,7 @@ def _differences(paths: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     orders = [values.flatten(3) for values in (paths, moments(paths, weights, 2), moments(paths, weights, 3))]
     values = torch.cat(orders, -1)
     ranges = (values.amax(1) - values.amin(1)).amax(1)
-    sizes = [of_order.shape[-1] for of_order in orders]
+    sizes = [order.shape[-1] for order in orders]
     limits = torch.from_numpy(np.repeat([_EQUAL, _NEARLY_EQUAL], sizes, -1)).to(ranges)
     different, very_different = (ranges[:, None] > limits).any(-1).unbind(-1)
     return different, very_different
@@ -118,21 +118,21 @@ def reach_of_blur(height: int, timing: RowTiming, motion: Motion) -> int:
 def _between_rows(positions: Positions, away: Tensor) -> tuple[Tensor, Tensor]:
     """Frame rows and shifts (B, G, S, N) of scene rows that are ``away`` (B, G, S, N) px from every scene row.
 
-    Cubic interpolation between whole scene rows has an error of 1e-5 px for 3 px and periods of 60 rows. To solve for
-    them takes a tenth to a third of the time of a detection behind long exposures.
+    Cubic interpolation between whole scene rows has an error of 1e-5 px for 3 px and periods of 60 rows. An exact
+    solution takes a tenth to a third of the time of a detection with long exposures.
     """
     count = positions.rows.shape[-1]
     margin = (positions.beyond.shape[-1] - count) // 2
-    here = torch.arange(margin, margin + count, dtype=away.dtype, device=away.device)
-    place = away.clamp(2 - margin, margin - 2) + here[:, None]
+    scene_place = torch.arange(margin, margin + count, dtype=away.dtype, device=away.device)
+    place = away.clamp(2 - margin, margin - 2) + scene_place[:, None]
     cell = place.floor()
     # the cubic polynomials (columns) by powers (rows) that are 1 at one of the places -1, 0, 1, 2 and 0 at the others
     cubic = place.new_tensor([[0, 6, 0, 0], [-2, -3, 6, -1], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6
     powers = torch.arange(4, device=away.device)
     weights = (place - cell)[..., None] ** powers @ cubic  # (B, G, S, N, 4)
     index = (cell.long()[..., None] + (powers - 1)).flatten(2)
-    near = positions.beyond.gather(3, index.expand(2, -1, -1, -1)).view(2, *weights.shape)
-    rows, shift = (near * weights).sum(-1).unbind(0)
+    neighbours = positions.beyond.gather(3, index.expand(2, -1, -1, -1)).view(2, *weights.shape)
+    rows, shift = (neighbours * weights).sum(-1).unbind(0)
     return rows, shift
 
 
@@ -159,11 +159,11 @@ def _warp_with_mean_moments(
     moments M of its path. The difference of the moments from their means over the group is added.
     """
     by_x = (2j * math.pi * spectra.frequencies).to(spectra.values.dtype)
-    of_second, of_third = moments(paths, weights, 2), moments(paths, weights, 3)
-    second = (of_second.mean(1, keepdim=True) - of_second) / 2
-    third = (of_third - of_third.mean(1, keepdim=True)) / 6
+    group_second, group_third = moments(paths, weights, 2), moments(paths, weights, 3)
+    second = (group_second.mean(1, keepdim=True) - group_second) / 2
+    third = (group_third - group_third.mean(1, keepdim=True)) / 6
     # the derivatives of a frame contain those of its moments, which change from row to row: to third order along y
-    change = second[..., 1, :, None, None] * torch.gradient(of_second, dim=2)[0][..., None, :, :]
+    change = second[..., 1, :, None, None] * torch.gradient(group_second, dim=2)[0][..., None, :, :]
     third = third - (change + change.transpose(-3, -2) + change.transpose(-3, -1)) / 3
     second, third = (values[..., None, None].to(by_x.real) for values in (second, third))
 
@@ -172,16 +172,16 @@ def _warp_with_mean_moments(
         images = spectra.warped(positions.rows[..., index], positions.shift[..., index])
         by_y, by_yy, by_yyy = _across_rows(torch.view_as_real(images), _FILTERS)
         images = images[:, :, _REACH:-_REACH]
-        here = torch.view_as_real(images)
+        pixels = torch.view_as_real(images)
         xx, xy, yy = (second[:, :, part, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
         xxx, xxy, xyy, yyy = (third[:, :, part, i, j, k] for i, j, k in ((0, 0, 0), (0, 0, 1), (0, 1, 1), (1, 1, 1)))
         total = images * by_x  # Horner's scheme in the derivative along the rows
-        numbers = torch.view_as_real(total)
-        numbers.mul_(xxx).addcmul_(by_y, xxy, value=3).addcmul_(here, xx)
+        total_values = torch.view_as_real(total)
+        total_values.mul_(xxx).addcmul_(by_y, xxy, value=3).addcmul_(pixels, xx)
         total.mul_(by_x)
-        numbers.addcmul_(by_y, xy, value=2).addcmul_(by_yy, xyy, value=3)
+        total_values.addcmul_(by_y, xy, value=2).addcmul_(by_yy, xyy, value=3)
         total.mul_(by_x)
-        numbers.addcmul_(by_yy, yy).addcmul_(by_yyy, yyy).add_(here)
+        total_values.addcmul_(by_yy, yy).addcmul_(by_yyy, yyy).add_(pixels)
         return total
 
     return warped
@@ -192,8 +192,8 @@ def _warp_along_paths(
 ) -> Callable[[slice], Tensor]:
     """``warp_to_scene`` of pairs: each frame is blurred once more, along the path of the other.
 
-    Both equal ``K_1 K_2 s`` of the scene s then: the mean of copies of the frame that are warped along the path of the
-    other. Kernels change from row to row, and such operators do not commute: a copy from a distance y was blurred by
+    Both frames are then ``K_1 K_2 s`` of the scene s. Blurring along a path is the mean of copies that are warped along
+    it. Kernels change from row to row, and such operators do not commute: a copy from a distance y was blurred by
     second moments M of the path that differ by ``y dM/ds`` to first order, which displaces detail by 0.01 px. Each node
     of the path is therefore corrected by ``y / 2 dM/ds`` times second derivatives of the image.
     """
@@ -207,19 +207,19 @@ def _warp_along_paths(
     def warped(part: slice) -> Tensor:
         index = _with_neighbours(part, positions, _SHORT_REACH)
         totals = by_x.new_zeros(2, *positions.rows.shape[:2], len(index), len(by_x))
-        of_numbers = torch.view_as_real(totals)
+        totals_values = torch.view_as_real(totals)
         copies = spectra.warped_copies(node_rows[..., index], node_shift[..., index])
-        for copy, of_node in zip(copies, factors[..., index, :, :], strict=True):
-            of_numbers.addcmul_(torch.view_as_real(copy), of_node)
+        for copy, factor in zip(copies, factors[..., index, :, :], strict=True):
+            totals_values.addcmul_(torch.view_as_real(copy), factor)
         mean, moment = totals  # of the copies, and of y times them
         by_y, by_yy = _across_rows(torch.view_as_real(moment), _SHORT_FILTERS)
         xx, xy, yy = (slope[:, :, part, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
         inner = slice(_SHORT_REACH, -_SHORT_REACH)
         total = moment[:, :, inner] * by_x
-        numbers = torch.view_as_real(total)
-        numbers.mul_(xx).addcmul_(by_y, xy, value=2)
+        total_values = torch.view_as_real(total)
+        total_values.mul_(xx).addcmul_(by_y, xy, value=2)
         total.mul_(by_x).add_(mean[:, :, inner])
-        numbers.addcmul_(by_yy, yy)
+        total_values.addcmul_(by_yy, yy)
         return total
 
     return warped

@@ -216,33 +216,32 @@ def _detect(stack: GreyFrames, timing: SensorTiming, options: FreeMotionOptions,
         motion = FreeMotion(torch.cat([motion.coefficients, still], 1), motion.start, motion.spacing, drifting)
         frames, rows, motion = _measured_around(motion, stack, rowwise, spacing, options.iterations, scale)
     measured = rows.measurements
-    of_blur = exposure_reasons(rowwise, *table(frames.blur_ratio(motion.to(stack.images.device)))[0].tolist())
-    residual = residual_of_motion(measured, motion[0])
-    weighed = measured.weighed(residual)
+    blur_reasons = exposure_reasons(rowwise, *table(frames.blur_ratio(motion.to(stack.images.device)))[0].tolist())
+    weighed = measured.weighed(residual_of_motion(measured, motion[0]))
     # 2. The last fit, with its uncertainty at the middles of exposures of up to 32 rows of each frame.
     starts = rowwise.frame_starts(stack.images.shape[1])
     rows_of_report = np.linspace(0, scale.height - 1, min(32, scale.height))
     times = starts[:, None] + tensor(rows_of_report) * rowwise.row_time + 0.5 * rowwise.exposure_time
     fit = fit_spline(weighed, motion.spacing, record, table(times).ravel())
-    spread = of_noise = _Spread.of(fit, measured, times)
+    spread = noise_spread = _Spread.of(fit, measured, times)
     by_row_time = np.zeros_like(measured.displacements)
     if rowwise.row_time_std:
         by_row_time = displacements_by_row_time(measured, motion[0], rowwise, len(starts))
         changed = replace(weighed, displacements=weighed.displacements + by_row_time)
-        other = fit_spline(changed, motion.spacing, record, table(times).ravel())
-        changes = other.coefficients - fit.coefficients
-        fit = replace(fit, covariances=[of + np.outer(c, c) for of, c in zip(fit.covariances, changes, strict=True)])
+        changes = fit_spline(changed, motion.spacing, record, table(times).ravel()).coefficients - fit.coefficients
+        covariances = [covariance + np.outer(c, c) for covariance, c in zip(fit.covariances, changes, strict=True)]
+        fit = replace(fit, covariances=covariances)
         spread = _Spread.of(fit, measured, times)
     motion = _motion(fit, (0.25 * scale.width, 0.25 * scale.height))  # px; beyond, frames share too little
     # 3. The tones that explain the rows as well.
-    free, spread = _with_tones(measured, motion[0], spread, of_noise.seen, times, rowwise, by_row_time)
+    free, spread = _with_tones(measured, motion[0], spread, noise_spread.seen, times, rowwise, by_row_time)
     # 4. The row bands, which may contradict the motion of the middle column.
-    of_middle: Motion = motion
+    middle_motion: Motion = motion
     if not scale.same_for_all_columns:
         middle = torch.zeros(1, dtype=torch.float64, device="cpu")
-        of_middle = ColumnMotion.of_columns(scale.free_motion(motion), middle, rowwise, len(starts), scale.height)
-    of_bands = _bands_reasons(start, scale.width, of_middle[0], scale.axes)
-    report = _report(free, spread, measured, timing, times, scale, of_bands, of_blur, rows.differential()[0])
+        middle_motion = ColumnMotion.of_columns(scale.free_motion(motion), middle, rowwise, len(starts), scale.height)
+    bands_reasons = _bands_reasons(start, scale.width, middle_motion[0], scale.axes)
+    report = _report(free, spread, measured, timing, times, scale, bands_reasons, blur_reasons, rows.differential()[0])
     return report.to(stack.images.device)
 
 
@@ -306,29 +305,29 @@ def _moved(measured: Measurements, motion: Motion) -> Array:
 
 
 def _bands_reasons(start: BandStart, columns: int, motion: Motion, axes: int) -> list[list[Reason]]:
-    """Reasons against a motion of each axis in row order that the row bands of one stack of ``columns`` px contradict.
+    """Reasons against each axis of a motion, in row order, from the row bands of one stack of ``columns`` px.
 
     Noise without a scene has offsets of any size, and rows that are measured around a fit to them confirm it.
     """
     # the pairs of frames one by one: one frame of noise, or of another scene, hardly changes the mean of all bands
     pairs, banded = start.curve.quality.shape[1:], start.measurements
-    offsets, rest = (
+    offsets, residual = (
         np.diff(values[0], axis=1).reshape(*pairs, 2)  # px
         for values in (banded.displacements, residual_of_motion(banded, motion))
     )
-    is_measured = banded.weights[0].min(-1).reshape(pairs) > 0
-    bands = compared_bands(np.where(is_measured[..., None], offsets, np.nan), offsets - rest, np.ones_like(is_measured))
-    left, spread = np.nanmax(bands["residual"], 0), np.nanmean(bands["size"], 0)
-    against, allowed = scene_reasons(start.curve, columns, of_pairs=True)[0], np.maximum(_MAX_BAND_ERROR, 0.3 * spread)
-    excess = left / allowed
+    valid = banded.weights[0].min(-1).reshape(pairs) > 0
+    bands = compared_bands(np.where(valid[..., None], offsets, np.nan), offsets - residual, np.ones_like(valid))
+    band_residuals, spread = np.nanmax(bands["residual"], 0), np.nanmean(bands["size"], 0)
+    against, allowed = scene_reasons(start.curve, columns, by_pair=True)[0], np.maximum(_MAX_BAND_ERROR, 0.3 * spread)
+    excess = band_residuals / allowed
     contradicted = {
-        name: Reason("bands_contradict", name, float(left[axis]), float(allowed[axis]))
+        name: Reason("bands_contradict", name, float(band_residuals[axis]), float(allowed[axis]))
         for axis, name in enumerate(AXIS_NAMES[:2])
         if excess[axis] > 1.0
     }
-    of_all = excess.max() > _MISMATCH
+    whole_motion = excess.max() > _MISMATCH
     return [
-        [*against, *(reason for name, reason in contradicted.items() if of_all or name == axis)]
+        [*against, *(reason for name, reason in contradicted.items() if whole_motion or name == axis)]
         for axis in AXIS_NAMES[:axes]
     ]
 
@@ -357,14 +356,14 @@ class _Spread:
 
     @classmethod
     def of(cls, fit: SplineFit, measured: Measurements, times: Tensor) -> Self:
-        """That of a spline."""
+        """The standard deviations of a spline."""
         return cls(fit.std_at(table(times)), *fit.std_of_visible(measured))
 
 
 # rms difference of the displacements of rows by tones from those by a spline, over their standard deviation. Of 240
 # axes of random walks and smooth motions in five frames, tones were at least 2.0 apart, of 160 axes with the right
 # tones at most 1.1
-_MAX_APART = 1.3
+_MAX_DIFFERENCE = 1.3
 # frames beyond the number of tones of an axis that may take the place of a spline: three tones agreed with a random
 # walk in two frames and were wrong by 21 px, with a standard deviation of 0.1 px
 _FRAMES_BESIDE = 2
@@ -374,7 +373,7 @@ def _with_tones(
     measured: Measurements,
     motion: FreeMotion,
     spread: _Spread,
-    seen: Array,
+    noise_std: Array,
     times: Tensor,
     timing: RowTiming,
     by_row_time: Array,
@@ -382,12 +381,13 @@ def _with_tones(
     """The motion with tones in place of the spline, on axes whose rows they explain as well.
 
     The spline has a smooth power spectrum, in which a tone near a multiple of the frame rate, which the frames hardly
-    show, is nearly missing. A few tones that agree with the same rows are the simpler explanation, and determine also
-    what all frames have in common. The spline is kept where the tones are more uncertain than they differ from it, and
-    where the frames are too few, so that different tones agree; their difference then counts as its standard deviation.
+    show, is nearly missing. A few tones that agree with the same rows are the simpler explanation, and also determine
+    the motion that all frames have in common. The spline is kept where the uncertainty of the tones exceeds their
+    difference from it, and where so few frames agree with different tones. The difference then counts as its standard
+    deviation.
 
-    ``seen`` (A,) px are the standard deviations of the motion of rows between frames by noise, ``by_row_time`` (1, N,
-    G, A) px the changes of the displacements by the standard deviation of the row time.
+    ``noise_std`` (A,) px are the standard deviations of the motion of rows between frames by noise, ``by_row_time`` (1,
+    N, G, A) px the changes of the displacements by the standard deviation of the row time.
     """
     # 1. The tones of the rows.
     residual = residual_of_motion(measured, motion)
@@ -395,31 +395,31 @@ def _with_tones(
     rows = replace(measured, independent=measured.independent_fraction(residual))
     single = find_tones(rows, interval, 1)
     for _ in range(2):  # the other side of a multiple of the frame rate, and then of another multiple
-        single = with_best_aliases(rows, single, wrong_size=0.0, most_left=1.0)
+        single = with_best_aliases(rows, single, large_size=0.0, max_share=1.0)
     fit = find_tones(rows, interval, start=single, least_gain=0.02)
     weighed = measured.weighed(residual_of(measured, fit))
     fit = fitted_again(weighed, fit)
     # 2. The axes on which they agree with the spline.
-    apart = (residual_of(measured, fit) - residual)[0][measured.visible[0] > 0]
-    agree = fit.active[0].any(-1) & (np.sqrt(np.square(apart).mean(0)) < _MAX_APART * seen)
+    deviation = (residual_of(measured, fit) - residual)[0][measured.visible[0] > 0]
+    agree = fit.active[0].any(-1) & (np.sqrt(np.square(deviation).mean(0)) < _MAX_DIFFERENCE * noise_std)
     if not agree.any():
         return motion, spread
     # 3. Their standard deviation, with the allowance for a further one and for the row time.
-    of_noise = with_further_tones(weighed, fit, table(times).ravel() - 0.5 * weighed.exposure_time)[1]
+    with_allowance = with_further_tones(weighed, fit, table(times).ravel() - 0.5 * weighed.exposure_time)[1]
     changed = replace(weighed, displacements=weighed.displacements + by_row_time)
-    moved, shifted = (motion_of_fit(one)[0].displacement(times) for one in (fit, fit_tones(changed, fit, fit.active)))
-    change = table(shifted - moved)
-    of_tones = np.hypot(of_noise.displacement_std[0], change - change.mean((0, 1)))
+    fits = fit, fit_tones(changed, fit, fit.active)
+    before, after = (motion_of_fit(tones)[0].displacement(times) for tones in fits)
+    change = table(after - before)
+    tone_std = np.hypot(with_allowance.displacement_std[0], change - change.mean((0, 1)))
     # 4. The axes on which they are better.
-    difference = table(_with_tones_on(motion, fit, agree).displacement(times) - motion.displacement(times))
-    size = difference.std((0, 1))
-    uncertain, of_spline = (np.sqrt(np.square(values).mean((0, 1))) for values in (of_tones, spread.of_rows))
-    taken = agree & ((uncertain < of_spline) | (2 * uncertain < size))
-    taken &= fit.active[0].sum(-1) <= len(times) - _FRAMES_BESIDE
+    size = table(_with_tones_on(motion, fit, agree).displacement(times) - motion.displacement(times)).std((0, 1))
+    tone_size, spline_size = (np.sqrt(np.square(values).mean((0, 1))) for values in (tone_std, spread.of_rows))
+    replaced = agree & ((tone_size < spline_size) | (2 * tone_size < size))
+    replaced &= fit.active[0].sum(-1) <= len(times) - _FRAMES_BESIDE
     # 5. The motion and its standard deviations.
-    of_rows = np.where(taken, of_tones, np.hypot(spread.of_rows, size))
-    unseen = np.where(taken, uncertain, np.hypot(spread.unseen, size))
-    return _with_tones_on(motion, fit, taken), _Spread(of_rows, spread.seen, unseen)
+    row_std = np.where(replaced, tone_std, np.hypot(spread.of_rows, size))
+    unseen = np.where(replaced, tone_size, np.hypot(spread.unseen, size))
+    return _with_tones_on(motion, fit, replaced), _Spread(row_std, spread.seen, unseen)
 
 
 def _with_tones_on(motion: FreeMotion, fit: ToneFit, axes: NDArray[np.bool_]) -> FreeMotion:
@@ -441,46 +441,46 @@ def _report(
     timing: SensorTiming,
     times: Tensor,
     scale: FieldScale,
-    of_bands: list[list[Reason]],
-    of_blur: list[Reason],
-    apart: Array,
+    bands_reasons: list[list[Reason]],
+    blur_reasons: list[Reason],
+    strip_difference: Array,
 ) -> MotionDetection:
     """The motion in image axes, and its uncertainty at times (T, R) of rows of every frame.
 
-    ``of_bands`` are the reasons of each axis from the row bands, ``of_blur`` those of all axes from the blur, ``apart``
-    (2,) px the rms difference of the displacements along a row that the motion does not explain.
+    ``bands_reasons`` are the reasons of each axis from the row bands, ``blur_reasons`` those of all axes from the blur.
+    ``strip_difference`` (2,) px is the rms difference of displacements along a row that the motion does not explain.
     """
-    # 1. Standard deviations, with what neither spline nor tones contain: motion that is faster than the knots.
+    # 1. Standard deviations, with the motion that is too fast for the knots, which neither spline nor tones contain.
     value, residual = motion.displacement(times), residual_of_motion(measured, motion)
     value = value - value.mean((0, 1))
     sudden = tensor(_sudden(measured, residual, table(times), motion.spacing))
-    unseen, rest = tensor(spread.unseen), tensor(measured.unexplained(residual)[0])
-    known = torch.hypot(tensor(spread.seen), sudden.square().mean((0, 1)).sqrt())
-    std, std_seen = torch.hypot(tensor(spread.of_rows), torch.hypot(sudden, rest)), torch.hypot(known, rest)
+    unseen, excess = tensor(spread.unseen), tensor(measured.unexplained(residual)[0])
+    known_std = torch.hypot(tensor(spread.seen), sudden.square().mean((0, 1)).sqrt())
+    std, std_seen = torch.hypot(tensor(spread.of_rows), torch.hypot(sudden, excess)), torch.hypot(known_std, excess)
     # 2. The verdict.
-    moved = (value - value.mean(0)).square().mean((0, 1)).sqrt()
+    rms = (value - value.mean(0)).square().mean((0, 1)).sqrt()
     nearly_blind = _nearly_blind(motion, times, timing)
     findings = []
     for axis, name in enumerate(AXIS_NAMES[: scale.axes]):
-        against, residual_of_axis = list(of_bands[axis]), float(rest[axis])
-        allowed = max(0.15 * float(moved[axis]), 0.03)  # px
+        against, residual_of_axis = list(bands_reasons[axis]), float(excess[axis])
+        allowed = max(0.15 * float(rms[axis]), 0.03)  # px
         if residual_of_axis > allowed:
             against.insert(0, Reason("motion_unexplained", name, residual_of_axis, allowed))
-        size = math.sqrt(2) * float(moved[axis] if scale.axes == 2 else moved[:2].amax())
-        against += rotation_reasons(axis, scale.axes, apart.tolist(), size)
-        if float(known[axis]) > _MAX_STD_SEEN:
-            against.append(Reason("motion_uncertain", name, float(known[axis]), _MAX_STD_SEEN))
-        displaced = float(value[..., axis].square().mean().sqrt())
-        limit = _MOST_UNKNOWN * displaced if nearly_blind[axis] else max(displaced, _MAX_STD_SEEN)
+        size = math.sqrt(2) * float(rms[axis] if scale.axes == 2 else rms[:2].amax())
+        against += rotation_reasons(axis, scale.axes, strip_difference.tolist(), size)
+        if float(known_std[axis]) > _MAX_STD_SEEN:
+            against.append(Reason("motion_uncertain", name, float(known_std[axis]), _MAX_STD_SEEN))
+        displacement = float(value[..., axis].square().mean().sqrt())
+        limit = _MOST_UNKNOWN * displacement if nearly_blind[axis] else max(displacement, _MAX_STD_SEEN)
         if float(unseen[axis]) > limit:
             against.append(Reason("common_motion_uncertain", name, float(unseen[axis]), limit))
-        in_common, limit = float(value[..., axis].mean(0).square().mean().sqrt()), _MOST_IN_COMMON * float(moved[axis])
+        in_common, limit = float(value[..., axis].mean(0).square().mean().sqrt()), _MOST_IN_COMMON * float(rms[axis])
         if in_common > limit:
             against.append(Reason("common_motion_large", name, in_common, limit))
-        findings.append((*against, *of_blur))
+        findings.append((*against, *blur_reasons))
     # 3. From row order and px to image axes and units.
-    reliable, units = torch.tensor([not against for against in findings], device=rest.device), scale.units(value)
-    sizes = {"std": std, "std_seen": std_seen, "unseen": unseen, "unexplained": rest}
+    reliable, units = torch.tensor([not against for against in findings], device=excess.device), scale.units(value)
+    sizes = {"std": std, "std_seen": std_seen, "unseen": unseen, "unexplained": excess}
     return MotionDetection(
         motion=scale.free_motion(motion).from_row_order(timing),
         times=times,
@@ -494,26 +494,26 @@ def _report(
 _SAMPLES = 4096  # of a motion in its record, for the spectrum: 500 per frame of 8
 
 
-def vibration_in_place_of(motion: FreeMotion, first: float, last: float) -> Vibration:
-    """A tone for each axis of a motion between two times in s.
+def vibration_in_place_of(motion: FreeMotion, start: float, end: float) -> Vibration:
+    """A tone that represents the motion of each axis between two times in s.
 
     The amplitude is that of a tone with the same rms displacement from a straight line. Frequency and phase are those
     of the largest part of the motion.
     """
     # 1. The motion, less a straight line.
-    times = torch.linspace(first, last, _SAMPLES, dtype=torch.float64, device=motion.coefficients.device)
-    moved = motion.displacement(times)
+    times = torch.linspace(start, end, _SAMPLES, dtype=torch.float64, device=motion.coefficients.device)
+    displacement = motion.displacement(times)
     centred = (times - times.mean())[:, None]
-    speed = (moved * centred).sum(0) / centred.square().sum()
-    moved = moved - moved.mean(0) - speed * centred
+    speed = (displacement * centred).sum(0) / centred.square().sum()
+    displacement = displacement - displacement.mean(0) - speed * centred
     # 2. Its size, and the largest part of its spectrum.
     window = torch.hann_window(_SAMPLES, dtype=torch.float64, device=times.device)[:, None]
-    spectrum = torch.fft.rfft(window * moved, n=4 * _SAMPLES, dim=0)
-    cycles = torch.fft.rfftfreq(4 * _SAMPLES, (last - first) / (_SAMPLES - 1), dtype=torch.float64, device=times.device)
+    spectrum = torch.fft.rfft(window * displacement, n=4 * _SAMPLES, dim=0)
+    cycles = torch.fft.rfftfreq(4 * _SAMPLES, (end - start) / (_SAMPLES - 1), dtype=torch.float64, device=times.device)
     largest = 1 + spectrum[1:].abs().argmax(0, keepdim=True)
     frequency = cycles[largest].mT  # (A, 1)
-    amplitude, phase = math.sqrt(2) * moved.square().mean(0)[:, None].sqrt(), spectrum.gather(0, largest).angle().mT
-    phase = phase + 0.5 * math.pi - 2 * math.pi * frequency * first
+    amplitude = math.sqrt(2) * displacement.square().mean(0)[:, None].sqrt()
+    phase = spectrum.gather(0, largest).angle().mT + 0.5 * math.pi - 2 * math.pi * frequency * start
     return Vibration(amplitude, frequency, phase, image_motion=speed)
 
 
@@ -524,9 +524,8 @@ def _nearly_blind(motion: FreeMotion, times: Tensor, timing: SensorTiming) -> li
     """
     if timing.frame_start_times is not None:
         return [False] * motion.num_axes
-    turns = vibration_in_place_of(motion, float(times.min()), float(times.max())).frequency[:, 0] * timing.frame_period
-    cycles = (turns - turns.round()).abs() * len(times)
-    return ((turns.round() >= 1) & (cycles < _NEARLY_BLIND)).tolist()
+    cycles = vibration_in_place_of(motion, float(times.min()), float(times.max())).frequency[:, 0] * timing.frame_period
+    return ((cycles.round() >= 1) & ((cycles - cycles.round()).abs() * len(times) < _NEARLY_BLIND)).tolist()
 
 
 # of the median mean square of residuals within a knot interval; smaller ones are noise. Of steps of 2 and 6 px within
@@ -536,12 +535,11 @@ _SUDDEN = 6.0
 
 def _sudden(measured: Measurements, residual: Array, times: Array, spacing: float) -> Array:
     """(T, R, A) px, rms residuals (1, N, G, A) within a ``spacing`` in s of times (T, R), where large; 0 elsewhere."""
-    seen = measured.visible[0] > 0
-    at = (measured.exposure_starts[0] + 0.5 * measured.exposure_time)[seen]
-    order = np.argsort(at)
-    squares = np.square(residual[0][seen][order])
+    visible = measured.visible[0] > 0
+    sample_times = (measured.exposure_starts[0] + 0.5 * measured.exposure_time)[visible]
+    order = np.argsort(sample_times)
+    squares = np.square(residual[0][visible][order])
     total = np.concatenate([np.zeros((1, squares.shape[-1])), np.cumsum(squares, 0)])
-    first, last = (np.searchsorted(at[order], times + side * spacing) for side in (-1.0, 1.0))
-    local = (total[last] - total[first]) / np.maximum(last - first, 1)[..., None]
-    usual = np.median(local, (0, 1))
-    return np.sqrt(np.where(local > _SUDDEN * usual, local, 0.0))
+    begins, ends = (np.searchsorted(sample_times[order], times + side * spacing) for side in (-1.0, 1.0))
+    local = (total[ends] - total[begins]) / np.maximum(ends - begins, 1)[..., None]
+    return np.sqrt(np.where(local > _SUDDEN * np.median(local, (0, 1)), local, 0.0))

@@ -45,28 +45,27 @@ class SplineFit:
     def std_of_visible(self, measured: Measurements) -> tuple[Array, Array]:
         """(A,) px, rms standard deviations of scene rows less their mean over the frames, and of this mean."""
         visible = measured.visible[0]
-        several = visible.sum(-1) > 1
-        visible, times = visible[several], measured.exposure_starts[0][several] + 0.5 * measured.exposure_time
+        in_several = visible.sum(-1) > 1
+        visible, times = visible[in_several], measured.exposure_starts[0][in_several] + 0.5 * measured.exposure_time
         first = np.where(visible > 0, times, np.inf).min(1, keepdims=True)
         times, count = np.where(visible > 0, times, first), self.coefficients.shape[-1]
         index, weights = spline_taps(times, self.start, self.spacing, count)
         sums = np.zeros((2, len(self.coefficients)))
-        for part in runs(len(visible), 256):  # (256, G, 4 G, 4 G) at a time
-            frames = visible[part].shape[1]
-            of_frames = np.eye(frames)[:, :, None] * weights[part, None]  # (n, G, G, 4)
-            of_frames = of_frames.reshape(-1, frames, 4 * frames)
-            share = visible[part] / visible[part].sum(1, keepdims=True)
-            mean = (share[:, :, None] * of_frames).sum(1, keepdims=True)
-            indices = index[part].reshape(-1, 4 * frames)
-            of_visible = self._variances(indices, of_frames - mean) * visible[part, :, None]
-            sums += np.stack([values.sum((0, 1)) for values in (of_visible, self._variances(indices, mean))])
+        for batch in runs(len(visible), 256):  # (256, G, 4 G, 4 G) at a time
+            frames = visible[batch].shape[1]
+            frame_weights = np.eye(frames)[:, :, None] * weights[batch, None]  # (n, G, G, 4)
+            frame_weights = frame_weights.reshape(-1, frames, 4 * frames)
+            share = visible[batch] / visible[batch].sum(1, keepdims=True)
+            mean = (share[:, :, None] * frame_weights).sum(1, keepdims=True)
+            indices = index[batch].reshape(-1, 4 * frames)
+            visible_variances = self._variances(indices, frame_weights - mean) * visible[batch, :, None]
+            sums += np.stack([values.sum((0, 1)) for values in (visible_variances, self._variances(indices, mean))])
         return np.sqrt(sums[0] / visible.sum()), np.sqrt(sums[1] / len(visible))
 
     def _variances(self, index: Array, weights: Array) -> Array:
         """Variances (S, F, A) of sums of ``weights`` (S, F, M) times coefficients ``index`` (S, M)."""
-        parts = [covariance[index[:, :, None], index[:, None]] for covariance in self.covariances]
-        variances = [((weights @ of_axis) * weights).sum(-1) for of_axis in parts]
-        return np.maximum(np.stack(variances, -1), 0.0)
+        covariances = [covariance[index[:, :, None], index[:, None]] for covariance in self.covariances]
+        return np.maximum(np.stack([((weights @ covariance) * weights).sum(-1) for covariance in covariances], -1), 0.0)
 
 
 def fit_spline(
@@ -76,8 +75,8 @@ def fit_spline(
 
     Minimises ``sum w (d - relative(D))^2 + lambda |D''|^2``; lambda maximises the marginal likelihood. Rows are
     compared within groups of frames only, so that the normal matrix is banded. ``record`` is start and end in seconds.
-    ``report_times`` (S,) in s are those over which the motion has mean 0, if its uncertainty is asked for. The power
-    spectrum of the motion is then estimated as well, for splines of up to 800 knots.
+    With ``report_times`` (S,) in s, over which the motion has mean 0, its uncertainty is estimated as well, and for
+    splines of up to 800 knots also its power spectrum.
     """
     first, last = record
     count = math.ceil((last - first) / spacing) + 3
@@ -94,13 +93,14 @@ def fit_spline(
         index, weights = spline_taps(begin[..., None] + average * nodes, first, spacing, count)  # (R, G, Q, 4)
         index, weights = index.reshape(*visible.shape, -1), (shares[:, None] * weights).reshape(*visible.shape, -1)
         # 2. The normal equations.
-        values, of_rows = measurements.displacements[0, ..., axis] * visible, measurements.inverse_variances[0, :, axis]
-        weighted, energy = of_rows[:, None] * values, float((of_rows[:, None] * np.square(values)).sum())
-        right = np.bincount(index.ravel(), (weights * weighted[..., None]).ravel(), count)
-        band = _normal_band(index, weights, visible, of_rows, count)
+        row_weights = measurements.inverse_variances[0, :, axis]
+        values = measurements.displacements[0, ..., axis] * visible
+        weighted, energy = row_weights[:, None] * values, float((row_weights[:, None] * np.square(values)).sum())
+        right_side = np.bincount(index.ravel(), (weights * weighted[..., None]).ravel(), count)
+        band = _normal_band(index, weights, visible, row_weights, count)
         # 3. Their solution.
-        known = max(float(measurements.num_measurements[0, axis]), 1.0)
-        value, covariance = _solved_spline(band, right, energy, known, mean)
+        num_measurements = max(float(measurements.num_measurements[0, axis]), 1.0)
+        value, covariance = _solved_spline(band, right_side, energy, num_measurements, mean)
         coefficients.append(value - value.mean())
         covariances += [] if covariance is None else [covariance]
     return SplineFit(np.stack(coefficients), first, spacing, covariances)
@@ -109,7 +109,7 @@ def fit_spline(
 def _normal_band(index: Array, weights: Array, visible: Array, row_weights: Array, count: int) -> Array:
     """Lower band (D, N) of the normal matrix of N = ``count`` coefficients for values relative to their group.
 
-    The value of a row in a frame depends on the coefficients ``index`` (R, G, M) by the factors ``weights``;
+    The value of a row in a frame depends on the coefficients ``index`` (R, G, M) by the factors ``weights``.
     ``visible`` (R, G) is 1 where a frame contains the row, else 0; ``row_weights`` (R,) are those of the rows.
     """
     number, frames = visible.shape
@@ -118,9 +118,9 @@ def _normal_band(index: Array, weights: Array, visible: Array, row_weights: Arra
     places = (value.repeat(index.shape[-1]), index.ravel())
     values = sparse.csr_array(((weights * visible[..., None]).ravel(), places), shape=(visible.size, count))
     values.eliminate_zeros()
-    of_rows = sparse.csr_array((visible.ravel(), (value, value // frames)), shape=(visible.size, number))
-    mean = sparse.diags_array(1 / np.maximum(visible.sum(1), 1.0)) @ (of_rows.T @ values)
-    relative = values - of_rows @ mean
+    expand_rows = sparse.csr_array((visible.ravel(), (value, value // frames)), shape=(visible.size, number))
+    mean = sparse.diags_array(1 / np.maximum(visible.sum(1), 1.0)) @ (expand_rows.T @ values)
+    relative = values - expand_rows @ mean
     # 2. The weighted products of the columns.
     normal = (relative.T @ sparse.diags_array(row_weights.repeat(frames)) @ relative).tocoo()
     below = normal.row >= normal.col
@@ -130,14 +130,14 @@ def _normal_band(index: Array, weights: Array, visible: Array, row_weights: Arra
 
 
 def _solved_spline(
-    band: Array, right: Array, energy: float, known: float, mean: Array | None
+    band: Array, right_side: Array, energy: float, num_measurements: float, mean: Array | None
 ) -> tuple[Array, Array | None]:
     """Coefficients (N,) of a smooth spline, and their covariance (N, N).
 
-    ``energy`` is the weighted sum of the squared displacements, of which ``known`` are independent; ``mean`` (N,) is a
-    function of the coefficients without variance, None for no covariance.
+    ``energy`` is the weighted sum of the squared displacements, of which ``num_measurements`` are independent.
+    ``mean`` (N,) are the weights of the mean of the motion, which has no variance; None for no covariance.
     """
-    count = len(right)
+    count = len(right_side)
     rounding = 1e-12 * energy  # error of the sums that make the residual energy
     scale = band[0].mean() + 1e-300
     bend = np.zeros((max(3, len(band)), count))  # of the squared second differences
@@ -150,30 +150,30 @@ def _solved_spline(
     def solution(smoothness: float) -> tuple[Array, Array]:
         """Coefficients and banded Cholesky factor of the normal matrix."""
         factor = linalg.cholesky_banded(base + smoothness * scale * bend, lower=True, check_finite=False)
-        return linalg.cho_solve_banded((factor, True), right, check_finite=False), factor
+        return linalg.cho_solve_banded((factor, True), right_side, check_finite=False), factor
 
     def evidence(smoothness: float) -> float:
         """Logarithm of the marginal likelihood."""
         coefficients, factor = solution(smoothness)
-        residual = max(energy - float(right @ coefficients), rounding) + 1e-300
+        residual = max(energy - float(right_side @ coefficients), rounding) + 1e-300
         logarithm = 2 * float(np.log(factor[0]).sum()) - (count - 2) * math.log(smoothness)
-        return -0.5 * (known * math.log(residual / known) + logarithm)
+        return -0.5 * (num_measurements * math.log(residual / num_measurements) + logarithm)
 
     decade = max((10.0**power for power in range(-8, 5)), key=evidence)
     smoothness = max((decade * 10 ** (step / 3) for step in (0, -2, -1, 1, 2)), key=evidence)
     coefficients, _ = solution(smoothness)
-    noise = max(energy - float(right @ coefficients), rounding) / known
+    noise = max(energy - float(right_side @ coefficients), rounding) / num_measurements
     if mean is None:
         return coefficients, None
     if count <= 800 and noise > 0:  # the cost grows with knots^3, 20 times
-        solved = _fit_with_spectrum(_dense(band), tensor(right), noise, smoothness * float(scale))
+        solved = _fit_with_spectrum(_dense(band), tensor(right_side), noise, smoothness * float(scale))
         coefficients, covariance = map(table, solved)
     else:
         factor = torch.linalg.cholesky(_dense(base + smoothness * scale * bend))
         covariance = noise * table(torch.cholesky_inverse(factor))
-    # the mean is taken out: c - (mean . c) instead of c
-    of_mean = covariance @ mean
-    return coefficients, covariance - of_mean - of_mean[:, None] + mean @ of_mean
+    # covariance of c - (mean . c) instead of c
+    mean_covariance = covariance @ mean
+    return coefficients, covariance - mean_covariance - mean_covariance[:, None] + mean @ mean_covariance
 
 
 def _dense(band: Array) -> Tensor:
@@ -182,7 +182,7 @@ def _dense(band: Array) -> Tensor:
     return tensor(lower + np.tril(lower, -1).T)
 
 
-def _fit_with_spectrum(gram: Tensor, right: Tensor, noise: float, smoothness: float) -> tuple[Tensor, Tensor]:
+def _fit_with_spectrum(normal: Tensor, right_side: Tensor, noise: float, smoothness: float) -> tuple[Tensor, Tensor]:
     """Coefficients (N,) of a spline and their covariance (N, N), with the power of each frequency estimated.
 
     A motion with a resonance has more power there than the smoothness penalty assumes, and may have more in
@@ -190,10 +190,10 @@ def _fit_with_spectrum(gram: Tensor, right: Tensor, noise: float, smoothness: fl
     cos(w_j (n + 1/2))`` with a_j of variance s_j. Expectation maximisation alternates between a for given s, and s_j =
     mean of ``a_j^2 + var(a_j)`` over neighbouring frequencies, relative to the penalty.
 
-    ``gram`` (N, N) and ``right`` (N,) are the normal equations, ``noise`` is the variance of measurements of unit
-    weight, and ``smoothness`` the weight of squared second differences to start with.
+    ``normal`` (N, N) and ``right_side`` (N,) are the normal equations, ``noise`` is the variance of measurements of
+    unit weight, and ``smoothness`` the weight of squared second differences to start with.
     """
-    count = len(right)
+    count = len(right_side)
     margin = max(10, count // 16)  # knots beyond the record, as cosines have zero slope at their ends
     length = count + 2 * margin
     order, place = tensor(np.arange(float(length))), tensor(np.arange(float(count)))
@@ -201,16 +201,16 @@ def _fit_with_spectrum(gram: Tensor, right: Tensor, noise: float, smoothness: fl
     waves = torch.cos(angle * (place[:, None] + margin + 0.5)) * math.sqrt(2 / length)
     line = place - place.mean()
     columns = torch.cat([waves, (line / line.norm())[:, None]], 1)
-    matrix = columns.mT @ gram @ columns / noise
-    target = columns.mT @ right / noise
+    matrix = columns.mT @ normal @ columns / noise
+    target = columns.mT @ right_side / noise
     expected = noise / smoothness * (2 * torch.sin(0.5 * angle[1:])) ** -4
     window = torch.exp(-0.5 * ((order[1:, None] - order[1:]) / 2.0) ** 2)  # standard deviation: one cycle in the record
     window = window / window.sum(1, keepdim=True)
     anchor = (1e-9 * matrix.diagonal().mean()).expand(1)  # makes the undetermined mean 0
     power = expected
     for _ in range(20):
-        whole = matrix + torch.diag(torch.cat([anchor, anchor + 1 / power, anchor]))
-        covariance = torch.cholesky_inverse(torch.linalg.cholesky(whole))
+        posterior_precision = matrix + torch.diag(torch.cat([anchor, anchor + 1 / power, anchor]))
+        covariance = torch.cholesky_inverse(torch.linalg.cholesky(posterior_precision))
         amplitude = covariance @ target
         second_moment = amplitude[1:-1].square() + covariance.diagonal()[1:-1]
         power = (window @ (second_moment / expected)) * expected

@@ -76,8 +76,7 @@ class ToneFit:
         drift = self.drift
         if drift.shape[-1] > 1:  # the constant of (s + moved)^2 / 2 cancels within the group
             drift = np.stack([drift[..., 0] + drift[..., 1] * shift, drift[..., 1]], -1)
-        turned = self.coefficients * unit_wave(turn)
-        return replace(self, coefficients=turned, drift=drift, centre=centre)
+        return replace(self, coefficients=self.coefficients * unit_wave(turn), drift=drift, centre=centre)
 
 
 def tone_response(measurements: Measurements, frequencies: Array) -> Array:
@@ -150,7 +149,7 @@ class _Estimate:
     residual: Array  # (B, N, G, 2) px
     cost: Array  # (B,) weighted square of the residual
     matrix: Array  # (B, M, M) normal matrix of all M = A P parameters
-    right: Array  # (B, M) its right-hand side
+    right_side: Array  # (B, M) its right-hand side
 
 
 class _Problem:
@@ -163,18 +162,18 @@ class _Problem:
         place = np.arange(exists.shape[-1])
         self.is_frequency = (place < 3 * self.tones) & (place % 3 == 2)  # (P,)
         # (B, M) bool, parameters that are fitted, and those of them on which displacements depend linearly
-        self.free, self.linear = (columns.reshape(len(active), -1) for columns in (exists, exists & ~self.is_frequency))
+        self.free, self.linear = (mask.reshape(len(active), -1) for mask in (exists, exists & ~self.is_frequency))
         drifts = measurements.drifts[..., :drift_order]
         self.drift_columns = np.broadcast_to(drifts, (*drifts.shape[:3], self.axes, drift_order))
         self.root = measurements.root[:, :, None]  # (B, N, 1, A, A)
 
     def of_stacks(self, index: Array) -> "_Problem":
         """The problem of some stacks."""
-        part = copy(self)
-        part.measurements = take_stacks([self.measurements], index)
+        selection = copy(self)
+        selection.measurements = take_stacks([self.measurements], index)
         for name in ("active", "free", "linear", "drift_columns", "root"):
-            setattr(part, name, getattr(self, name)[index])
-        return part
+            setattr(selection, name, getattr(self, name)[index])
+        return selection
 
     def tones_of(self, values: Array) -> Array:
         """Tones (B, 2, K, 3) of parameters (B, 2, P), as in ``_jacobian_of_tones``."""
@@ -241,8 +240,8 @@ class _Problem:
         linear = np.where(self.is_frequency, 0.0, values)[:, None, None]
         residual = self.measurements.displacements - np.vecdot(jacobian, linear)
         columns, whitened = self.in_std(jacobian, residual)
-        right = (columns.mT @ whitened)[..., 0]
-        return _Estimate(values, jacobian, residual, np.square(whitened).sum((1, 2)), columns.mT @ columns, right)
+        right_side = (columns.mT @ whitened)[..., 0]
+        return _Estimate(values, jacobian, residual, np.square(whitened).sum((1, 2)), columns.mT @ columns, right_side)
 
     def moved(self, values: Array, step: Array) -> Array:
         """Parameters (B, 2, P) after a step (B, M); frequencies stay positive."""
@@ -259,7 +258,7 @@ class _Problem:
         return self.evaluate(self.moved(state.values, _step(state, self.linear, np.zeros_like(state.cost))))
 
     def solve(self, start: Array | ToneFit, iterations: int, tolerance: float) -> _Estimate:
-        """Levenberg-Marquardt, each stack on its own, until a step promises a relative decrease below the tolerance."""
+        """Levenberg-Marquardt, for each stack until a step promises a relative decrease below the tolerance."""
         # 1. Start values.
         if isinstance(start, ToneFit):
             start = start.about(self.measurements.centre)
@@ -270,17 +269,17 @@ class _Problem:
             values[..., self.is_frequency] = np.where(self.active, start, 0.0)
             state = self.with_best_amplitudes(self.evaluate(values))
         # 2. Damped steps. A step that decreases the cost is taken, and the damping of a stack decreases or increases.
-        # Stacks that are done leave the batch.
+        # Converged stacks leave the batch.
         problem, stacks, damping = self, np.arange(len(state.cost)), np.full_like(state.cost, 1e-3)
         finished: list[_Estimate] = []
         order: list[Array] = []
         for _ in range(iterations):
             step = _step(state, problem.free, damping)
-            done = (step * state.right).sum(-1) <= tolerance * state.cost
-            if bool(done.all()):
+            converged = (step * state.right_side).sum(-1) <= tolerance * state.cost
+            if bool(converged.all()):
                 break
-            if bool(done.any()):
-                (ended,), (index,) = done.nonzero(), (~done).nonzero()
+            if bool(converged.any()):
+                (ended,), (index,) = converged.nonzero(), (~converged).nonzero()
                 finished.append(take_stacks([state], ended))
                 order.append(stacks[ended])
                 problem, state = problem.of_stacks(index), take_stacks([state], index)
@@ -310,7 +309,7 @@ def _scaled(state: _Estimate, free: Array, damping: Array) -> tuple[Array, Array
 def _step(state: _Estimate, free: Array, damping: Array) -> Array:
     """Step (B, M) of the ``free`` (B, M) parameters."""
     matrix, scale = _scaled(state, free, damping)
-    scaled: Array = np.linalg.solve(matrix, (state.right * scale)[..., None])[..., 0]
+    scaled: Array = np.linalg.solve(matrix, (state.right_side * scale)[..., None])[..., 0]
     return scaled * scale
 
 
@@ -349,13 +348,13 @@ def fit_tones(
 
 
 def fitted_again(measurements: Measurements, fit: ToneFit) -> ToneFit:
-    """``fit_tones`` from an earlier fit, and that fit itself for stacks where it diverges."""
+    """``fit_tones`` from an earlier fit; the earlier fit for stacks where it diverges."""
     exact = fit_tones(measurements, fit, fit.active)
     return select_stacks(is_bounded(exact, measurements.exposure_time), exact, fit)
 
 
-# px, motion during an exposure; px and px/s, amplitude and drift; Hz. Fits beyond diverge: frames are smaller. A path
-# of 700 px in each of four frames of 400 px took 120 s
+# px, motion during an exposure; px, amplitude; Hz. Fits with larger values have diverged: frames are smaller. A path of
+# 700 px in each of four frames of 400 px took 120 s
 _MAX_PATH, _MAX_SIZE, _MAX_FREQUENCY = 300.0, 1e6, 1e9
 
 
@@ -399,10 +398,10 @@ def motion_of_fit(fit: ToneFit, device: torch.device | None = None) -> Vibration
 def vibration_of_fit(fit: ToneFit) -> tuple[Vibration, VibrationStd]:
     """``motion_of_fit`` and its standard deviations; 0 for tones that are not active.
 
-    They are of first order, but for uncertain frequencies. Rows determine the square of the frequency f of a slow tone,
-    and the inverse of an amplitude that depends on f, with symmetric errors; the image motion compensates a slow tone
-    in proportion to its period. The stated deviation of these is half of the distance to the limit that two standard
-    deviations give, at most 4.5 times the value.
+    They are of first order, except for uncertain frequencies. Rows determine the square of the frequency f of a slow
+    tone, and the inverse of an amplitude that depends on f, with symmetric errors; the image motion compensates a slow
+    tone in proportion to its period. The standard deviation of these is half of the distance to the limit at two
+    standard deviations, at most 4.5 times the value.
     """
     # 1. First order.
     centre = fit.centre[:, None, None]
@@ -418,10 +417,10 @@ def vibration_of_fit(fit: ToneFit) -> tuple[Vibration, VibrationStd]:
     tones, axes = 3 * fit.frequencies.shape[-1], _covariance_of_axes(fit)
     drift, by_frequency = axes[..., tones:, tones:], axes[..., 2:tones:3, :]  # covariances of each frequency
     by_frequency = by_frequency / np.where(frequency_std > 0, frequency_std, np.inf)[..., None]
-    of_motion, of_acceleration = drift[..., 0, 0], np.zeros_like(drift[..., 0, 0])
+    motion_variance, acceleration_variance = drift[..., 0, 0], np.zeros_like(drift[..., 0, 0])
     if fit.drift.shape[-1] > 1:
-        of_acceleration, to_origin = drift[..., 1, 1], centre[..., 0]
-        of_motion = of_motion - 2 * to_origin * drift[..., 0, 1] + np.square(to_origin) * of_acceleration
+        acceleration_variance, shift = drift[..., 1, 1], centre[..., 0]
+        motion_variance = motion_variance - 2 * shift * drift[..., 0, 1] + np.square(shift) * acceleration_variance
     # 2. The limits of f and of its period, relative to their values, and the amplitude and the image motion with them.
     share = frequency_std / frequency
     lower = np.sqrt(np.maximum(1 - 4 * share, 0.01))
@@ -429,26 +428,24 @@ def vibration_of_fit(fit: ToneFit) -> tuple[Vibration, VibrationStd]:
     place = np.arange(frequency.shape[-1])
     along = np.abs(real * by_frequency[..., place, 3 * place] + imaginary * by_frequency[..., place, 3 * place + 1])
     larger = 0.5 * amplitude * (1 / np.maximum(1 - 2 * along / amplitude, 0.1) - 1)
-    other = np.sqrt(np.maximum(np.square(amplitude_std) - np.square(along), 0.0))
-    amplitude_std = np.hypot(other, np.maximum(larger, along))
+    remaining_std = np.sqrt(np.maximum(np.square(amplitude_std) - np.square(along), 0.0))
+    amplitude_std = np.hypot(remaining_std, np.maximum(larger, along))
     growth = np.square(longer / np.maximum(share, 1e-300)) - 1
-    of_motion = of_motion + (np.square(by_frequency[..., tones]) * np.where(share > 0, growth, 0.0)).sum(-1)
+    motion_variance = motion_variance + (np.square(by_frequency[..., tones]) * np.where(share > 0, growth, 0.0)).sum(-1)
     frequency_std = np.maximum(0.5 * frequency * (1 - lower), frequency_std)
     # 3. The order of the tones of a Vibration.
     order = (-fit.amplitude).argsort(-1, stable=True)
-    of_tones = np.stack([amplitude_std, frequency_std, longer / frequency, phase_std]) * fit.active
-    drift_std = np.sqrt(np.maximum([of_motion, of_acceleration], 0.0))
-    of_parameters = (*np.take_along_axis(of_tones, order[None], -1), *drift_std)
-    return motion_of_fit(fit), VibrationStd(*map(tensor, of_parameters))
+    tone_std = np.stack([amplitude_std, frequency_std, longer / frequency, phase_std]) * fit.active
+    drift_std = np.sqrt(np.maximum([motion_variance, acceleration_variance], 0.0))
+    parameter_std = (*np.take_along_axis(tone_std, order[None], -1), *drift_std)
+    return motion_of_fit(fit), VibrationStd(*map(tensor, parameter_std))
 
 
 def displacement_std(fit: ToneFit, exposure_starts: Array, exposure_time: float) -> Array:
     """Standard deviation (B, 2) in px of the displacement of rows (N,) without their mean, rms over the rows."""
     jacobian = displacement_jacobian(fit, exposure_starts[None], exposure_time)
-    jacobian = jacobian - jacobian.mean(1, keepdims=True)
-    covariance = _covariance_of_axes(fit)
-    jacobian = jacobian.swapaxes(1, 2)  # (B, A, N, P)
-    return np.sqrt(np.maximum(((jacobian @ covariance) * jacobian).sum(-1), 0.0).mean(-1))
+    jacobian = (jacobian - jacobian.mean(1, keepdims=True)).swapaxes(1, 2)  # (B, A, N, P)
+    return np.sqrt(np.maximum(((jacobian @ _covariance_of_axes(fit)) * jacobian).sum(-1), 0.0).mean(-1))
 
 
 def displacement_jacobian(fit: ToneFit, exposure_starts: Array, exposure_time: float) -> Array:
@@ -484,8 +481,7 @@ def shrunk(fit: ToneFit, intervals: Array) -> ToneFit:
     """The fit with uncertain amplitudes near blind frequencies reduced, for warping frames by its motion.
 
     An amplitude A of standard deviation s becomes ``A max(0, 1 - s^2 / A^2)`` (positive-part James-Stein estimate)
-    where the gain is small. Tones that hardly move the frames against each other, but through ``LARGEST`` of their
-    size, are left out.
+    where the gain is small. Nearly blind tones whose amplitude exceeds about ``LARGEST`` are left out.
     """
     blindness = 1 / (1 + np.square(offset_gain(fit.frequencies, intervals) / MIN_GAIN))
     noise = np.square(amplitude_std(fit) / np.maximum(np.abs(fit.coefficients), 1e-30))
@@ -504,7 +500,7 @@ def strongest_only(fit: ToneFit) -> ToneFit:
 
 
 def with_tones(fit: ToneFit, count: int) -> ToneFit:
-    """The fit with room for ``count`` tones on each axis; the further ones do not exist."""
+    """The fit with arrays for ``count`` tones on each axis; the added ones are not active."""
     further = ((0, 0), (0, 0), (0, count - fit.active.shape[-1]))
     names = ("coefficients", "frequencies", "active")
     extended: Table = {name: np.pad(getattr(fit, name), further) for name in names}
@@ -512,7 +508,7 @@ def with_tones(fit: ToneFit, count: int) -> ToneFit:
 
 
 def covariance_with_tones(covariance: Array, fit: ToneFit, count: int) -> Array:
-    """A covariance (B, A P, A P) of the parameters of a fit as that of ``count`` tones on each axis; 0 for others."""
+    """A covariance (B, A P, A P) of the parameters of a fit, enlarged to ``count`` tones on each axis by zeros."""
     axes, tones = fit.active.shape[1:]
     added = np.full(axes, 3 * (count - tones))
     places = np.repeat((np.arange(axes) + 1) * (covariance.shape[-1] // axes) - fit.drift.shape[-1], added)
@@ -520,7 +516,7 @@ def covariance_with_tones(covariance: Array, fit: ToneFit, count: int) -> Array:
 
 
 def with_axes(fit: ToneFit, axes: int) -> ToneFit:
-    """The strongest tones of a fit as one with further axes, which have no tones; without a covariance."""
+    """The strongest tone of each axis of a fit, with further axes that have no tones; without a covariance."""
     fit = strongest_only(fit)
     further = ((0, 0), (0, axes - fit.active.shape[1]), (0, 0))
     names = ("coefficients", "frequencies", "active", "drift")

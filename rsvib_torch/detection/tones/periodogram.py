@@ -31,31 +31,32 @@ def _power(measurements: Measurements, grid: tuple[float, int, int], weights: Ar
     """
     # 1. Weights of rows and frames, and the normal equations of the image motion.
     visible, time = measurements.visible, measurements.middles[..., 0, 0]
-    of_rows = weights.swapaxes(2, 3)  # (B, S, A, N)
-    frame_weights = of_rows[..., None] * visible[:, None, None]  # (B, S, A, N, G)
+    row_weights = weights.swapaxes(2, 3)  # (B, S, A, N)
+    frame_weights = row_weights[..., None] * visible[:, None, None]  # (B, S, A, N, G)
     drift = measurements.drifts[:, None, None, :, :, 0, 0]
     values = np.moveaxis(measurements.displacements, -1, 1)[:, None]  # (B, 1, A, N, G)
-    of_drift = frame_weights * drift
-    drift_drift, drift_value = ((of_drift * factor).sum((-2, -1))[..., None] for factor in (drift, values))
+    weighted_drift = frame_weights * drift
+    drift_drift, drift_value = ((weighted_drift * factor).sum((-2, -1))[..., None] for factor in (drift, values))
     drift_drift = drift_drift * (1 + 1e-12) + _TINY
-    most = (of_rows * measurements.num_differences[:, None, None]).sum(-1)[..., None]
-    prior = 0.5 * MIN_GAIN**2 * most + _TINY
+    total = (row_weights * measurements.num_differences[:, None, None]).sum(-1)[..., None]
+    prior = 0.5 * MIN_GAIN**2 * total + _TINY
 
     # 2. Q and R from transforms of the pairs of frames, each pair once, with the attenuation by the exposure.
-    step, first, count = grid
-    frequencies = step * np.arange(first, first + count)
+    step, first_step, count = grid
+    frequencies = step * np.arange(first_step, first_step + count)
     attenuation = np.sinc(frequencies * measurements.smearing_times[:, 0]).prod(0)  # (A, F)
     earlier, later = np.triu_indices(time.shape[2])
     share = visible[..., earlier] * visible[..., later] / np.maximum(visible.sum(2, keepdims=True), 1.0)
-    of_squares = np.where(earlier == later, visible[..., earlier] - share, -2 * share)
-    Q = fourier_sums(time[..., earlier] + time[..., later], of_rows[..., None] * of_squares[:, None, None], grid)
-    differs = earlier != later
-    of_moduli = of_rows[..., None] * (2 * share[..., differs])[:, None, None]
-    R = most - fourier_sums(time[..., later[differs]] - time[..., earlier[differs]], of_moduli, grid).real
+    square_weights = np.where(earlier == later, visible[..., earlier] - share, -2 * share)
+    square_weights = row_weights[..., None] * square_weights[:, None, None]
+    Q = fourier_sums(time[..., earlier] + time[..., later], square_weights, grid)
+    different = earlier != later
+    pair_weights = row_weights[..., None] * (2 * share[..., different])[:, None, None]
+    R = total - fourier_sums(time[..., later[different]] - time[..., earlier[different]], pair_weights, grid).real
     Q, R = Q * np.square(attenuation), R * np.square(attenuation)
 
     # 3. Products of the waves with the image motion and with the displacements.
-    products = fourier_sums(time, np.stack([of_drift, frame_weights * values], 1), grid) * attenuation
+    products = fourier_sums(time, np.stack([weighted_drift, frame_weights * values], 1), grid) * attenuation
     with_drift, with_values = np.moveaxis(products, 1, 0)
 
     return explained_power(Q, R + 2 * prior, with_values, with_drift, drift_value, drift_drift)
@@ -66,16 +67,16 @@ def explained_power(
 ) -> Array:
     """Decrease of the weighted sum of squares by a wave and an image motion.
 
-    ``Q`` and ``R`` are weighted sums of the square of the complex wave and of its squared modulus, the others those of
-    products: of the wave ``with_values`` and ``with_drift``, the drift by a unit image motion; of drift and values; and
-    of the drift with itself.
+    ``Q`` and ``R`` are weighted sums of the square of the complex wave and of its squared modulus. The others are sums
+    of products: of the wave ``with_values`` and ``with_drift`` (the drift by a unit image motion), of drift and values,
+    and of the drift with itself.
     """
     # Normal equations of cosine and sine after elimination of the image motion, and the decrease by their solution.
     cosine = 0.5 * (R + Q.real) - np.square(with_drift.real) / drift_drift
     sine = 0.5 * (R - Q.real) - np.square(with_drift.imag) / drift_drift
     cross = 0.5 * Q.imag - with_drift.real * with_drift.imag / drift_drift
-    right = with_values - with_drift * (drift_value / drift_drift)
-    decrease = sine * np.square(right.real) - 2 * cross * right.real * right.imag + cosine * np.square(right.imag)
+    target = with_values - with_drift * (drift_value / drift_drift)
+    decrease = sine * np.square(target.real) - 2 * cross * target.real * target.imag + cosine * np.square(target.imag)
     determinant = np.maximum(cosine * sine - np.square(cross), _TINY)
     return decrease / determinant + np.square(drift_value) / drift_drift
 
@@ -91,13 +92,13 @@ def strongest_frequencies(measurements: Measurements, sample_interval: float, co
     stacks, weightings = weights.shape[:2]
     at_once, count = max(1, _MAX_POWERS // grid[2]), min(count, grid[2])
     places = np.empty((stacks, weightings, weights.shape[-1], count), np.int64)
-    for part in runs(stacks, max(1, at_once // weightings)):
-        some = take_stacks([measurements], np.arange(stacks)[part])
+    for batch in runs(stacks, max(1, at_once // weightings)):
+        batch_measurements = take_stacks([measurements], np.arange(stacks)[batch])
         for weighting in runs(weightings, at_once):
-            total = _power(some, grid, weights[part, weighting])
+            total = _power(batch_measurements, grid, weights[batch, weighting])
             # a peak is the maximum within half of 1 / duration on either side
             peak = total >= ndimage.maximum_filter1d(total, 2 * window + 1, mode="nearest")
-            places[part, weighting] = np.where(peak, -total, 1.0).argsort(-1, stable=True)[..., :count]
+            places[batch, weighting] = np.where(peak, -total, 1.0).argsort(-1, stable=True)[..., :count]
     return grid[0] * (places + grid[1])
 
 
@@ -120,9 +121,9 @@ def without_stretches(measurements: Measurements) -> Array:
     """(8, N) bool, rows to use: all, then all but one of seven overlapping stretches of 35 %, for outliers of 24 %."""
     rows = measurements.exposure_starts.shape[1]
     place = (np.arange(rows) + 0.5) / rows
-    first = np.linspace(0, 0.65, 7)[:, None]
-    kept = (place < first) | (place > first + 0.35)
-    return np.concatenate([np.ones_like(kept[:1]), kept])
+    start = np.linspace(0, 0.65, 7)[:, None]
+    used = (place < start) | (place > start + 0.35)
+    return np.concatenate([np.ones_like(used[:1]), used])
 
 
 def best_candidate(
@@ -145,9 +146,9 @@ def best_candidate(
     # 1. The parts of the record that are searched: all rows, and the rows without a stretch.
     parts, weights, peaks = measurements, weighed.weights[:, None], 4  # outliers may raise a wrong peak
     if leave_out:
-        kept = without_stretches(measurements)
-        parts = measurements.repeated(len(kept)).scaled(np.tile(kept, (len(weights), 1))[..., None].astype(np.float64))
-        weights, peaks = np.concatenate([weights, kept[1:, :, None] * measurements.weights[:, None]], 1), 2
+        used = without_stretches(measurements)
+        parts = measurements.repeated(len(used)).scaled(np.tile(used, (len(weights), 1))[..., None].astype(np.float64))
+        weights, peaks = np.concatenate([weights, used[1:, :, None] * measurements.weights[:, None]], 1), 2
     # 2. The highest peaks of each part, for the two axes, each fitted roughly with the tones of the earlier fit.
     unexplained = replace(measurements, displacements=residual)
     peaks_of_parts = strongest_frequencies(unexplained, sample_interval, peaks, weights)  # (B, S, 2, C)
@@ -160,17 +161,17 @@ def best_candidate(
         np.repeat(active, count, 0),
         before.drift_order,
     )
-    # 3. For each axis the fit that explains most, of which 65 % of the rows count: outliers may be all others. A tone
-    # that is nearly blind counts less.
+    # 3. For each axis the fit with the smallest residual of the best 65 % of the rows: the others may be outliers. A
+    # nearly blind tone counts less.
     several = measurements.thinned().repeated(count)
     size = split_axis(without_nan(quantile(several.sizes(residuals), 0.65, 1), 0.0), 0, -1, count)
     visible = split_axis(visibility(several, rough.frequencies[..., -1]), 0, -1, count)
     best = ((size.max(1, keepdims=True) - size) * visible).argmax(1)  # (B, 2)
 
     def chosen(values: Array, axis: int) -> Array:
-        tried = np.moveaxis(split_axis(values, 0, -1, count), axis + 1, 2)  # (B, C, 2, ...)
-        place = best.reshape(-1, 1, best.shape[-1], *(1,) * (tried.ndim - 3))
-        return np.moveaxis(np.take_along_axis(tried, place, 1)[:, 0], 1, axis)
+        candidates = np.moveaxis(split_axis(values, 0, -1, count), axis + 1, 2)  # (B, C, 2, ...)
+        place = best.reshape(-1, 1, best.shape[-1], *(1,) * (candidates.ndim - 3))
+        return np.moveaxis(np.take_along_axis(candidates, place, 1)[:, 0], 1, axis)
 
     best_tones = {name: chosen(getattr(rough, name), 1) for name in ("coefficients", "frequencies", "drift")}
     fit = ToneFit(**best_tones, active=active, covariance=rough.covariance[:0], centre=rough.centre[::count])

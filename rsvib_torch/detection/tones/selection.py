@@ -54,40 +54,40 @@ _ALIASES, _WRONG_SIZE = 2, 3.0  # frequencies on either side; standard deviation
 
 
 def with_best_aliases(
-    measurements: Measurements, fit: ToneFit, wrong_size: float = _WRONG_SIZE, most_left: float = 0.5
+    measurements: Measurements, fit: ToneFit, large_size: float = _WRONG_SIZE, max_share: float = 0.5
 ) -> ToneFit:
-    """One tone of each axis, of the frequency ``|k / T + f|`` that leaves the smallest residual; without covariance.
+    """One tone of each axis, at the frequency ``|k / T + f|`` with the smallest residual; without covariance.
 
     Tones that are a multiple of 1 / T apart, T the interval of the frames, or on both sides of one, differ within a
     frame only. Bands may confuse them: in 7 of 72 stacks of 6 to 8 frames, a tone of 90.5 Hz was taken for one of 30.2
     Hz, and further tones explained the difference, so that the axis was reliable and wrong. The measurements are of
-    rows, the fit has one tone of each axis. Others are tried on axes whose typical residual exceeds ``wrong_size``
-    standard deviations, and taken where less than the fraction ``most_left`` of the residual is left.
+    rows, the fit has one tone of each axis. Other frequencies are tried on axes whose typical residual exceeds
+    ``large_size`` standard deviations, and accepted where less than the fraction ``max_share`` of the residual remains.
     """
     size = without_nan(median(measurements.sizes(residual_of(measurements, fit)), 1), 0.0)  # (B, A)
-    wrong = (size > wrong_size) & fit.active[..., 0]
-    if not bool(wrong.any()):
+    is_large = (size > large_size) & fit.active[..., 0]
+    if not bool(is_large.any()):
         return fit
     parameters = fit.parameters[0].size
     fit = replace(fit, covariance=np.zeros((len(size), parameters, parameters)))
     thinned = measurements.thinned()
     steps = np.repeat(np.arange(-_ALIASES, _ALIASES + 1), 2)
     signs = np.tile([1.0, -1.0], len(steps) // 2)
-    for axis in np.flatnonzero(wrong.any(0)):
+    for axis in np.flatnonzero(is_large.any(0)):
         # 1. The aliases of the tone of this axis, each fitted roughly.
-        (index,) = wrong[:, axis].nonzero()
-        tried = np.repeat(index, len(steps))
-        some, frequencies = take_stacks([thinned], tried), fit.frequencies[tried]
+        (index,) = is_large[:, axis].nonzero()
+        stacks = np.repeat(index, len(steps))
+        trial, frequencies = take_stacks([thinned], stacks), fit.frequencies[stacks]
         frequencies[:, axis, 0] = np.abs(
             (signs * fit.frequencies[index, axis] + steps / measurements.interval[index, None]).ravel()
         )
-        others, residual = fit_roughly(some, frequencies, fit.active[tried], fit.drift_order)
-        # 2. The best one, where it leaves little enough of the residual.
-        sizes = without_nan(median(some.sizes(residual), 1), np.inf)[:, axis].reshape(len(index), -1)
-        place, better = np.arange(len(size)), sizes.min(1) < most_left * size[index, axis]
+        aliases, residual = fit_roughly(trial, frequencies, fit.active[stacks], fit.drift_order)
+        # 2. The best alias is accepted where its residual is small enough.
+        sizes = without_nan(median(trial.sizes(residual), 1), np.inf)[:, axis].reshape(len(index), -1)
+        place, better = np.arange(len(size)), sizes.min(1) < max_share * size[index, axis]
         best = len(size) + np.arange(len(index)) * len(steps) + sizes.argmin(1)
         place[index[better]] = best[better]
-        fit = take_stacks([fit, others], place)
+        fit = take_stacks([fit, aliases], place)
     return fit
 
 
@@ -132,7 +132,7 @@ def find_tones(
 
 @dataclass(eq=False)
 class _Search:
-    """State of ``find_tones``, whose arguments it has."""
+    """State of ``find_tones``; the fields are its arguments."""
 
     measurements: Measurements
     sample_interval: float
@@ -156,7 +156,7 @@ class _Search:
             self.accepted = start.active
             residual = residual_of(self.measurements, start)
             self.fit, self.weighted = self.refitted(start.frequencies, start.active, residual)
-        self.open_axes: Array = np.ones((stacks, axes), dtype=bool)  # that may need a further tone
+        self.open_axes: Array = np.ones((stacks, axes), dtype=bool)  # axes that may need a further tone
         if start is not None and self.accuracy:  # a tone of roll in bands of strips is found as one of x or y otherwise
             self.open_axes = ~np.any(start.active, -1)
         self.remaining = MAX_TONES - (0 if self.tones is not None else self.accepted.shape[-1])
@@ -226,9 +226,9 @@ class _Search:
         if not bool(disturbed.any()):
             return fit, weighted
         rough = self.candidate(residual, active, leave_out=True)
-        other, other_weighted = self.refitted(rough[0].frequencies, active, rough[1])
-        better = disturbed & (typical_size(self.measurements, other) < typical_size(self.measurements, fit))
-        return select_stacks(better, other, fit), select_stacks(better, other_weighted, weighted)
+        without_stretch, weighted_without = self.refitted(rough[0].frequencies, active, rough[1])
+        better = disturbed & (typical_size(self.measurements, without_stretch) < typical_size(self.measurements, fit))
+        return select_stacks(better, without_stretch, fit), select_stacks(better, weighted_without, weighted)
 
     def is_visible(self, fit: ToneFit) -> Array:
         """(B, 2) bool, whether the last tone of each axis is visible."""
@@ -236,22 +236,21 @@ class _Search:
 
     def is_inexact(self, residual: Array) -> Array:
         """(B, 2) bool, axes with residuals above the accuracy that is needed."""
-        most = without_nan(quantile(self.measurements.distances(residual), 0.9, 1), np.inf)
-        return (most > self.accuracy) | (self.accuracy == 0)
+        large_distance = without_nan(quantile(self.measurements.distances(residual), 0.9, 1), np.inf)
+        return (large_distance > self.accuracy) | (self.accuracy == 0)
 
     def decreases(self, weighted: Measurements, before: Array, after: Array, *, share: float = 1.0) -> Array:
-        """(B, 2) bool, whether the residual decreases by a share of what is needed for a further tone."""
-        first, second = weighted.square(before), weighted.square(after)
+        """(B, 2) bool, whether the residual decreases by a share of the amount that a further tone needs."""
+        square_before, square_after = weighted.square(before), weighted.square(after)
         spare = self.measurements.num_measurements - 3 * self.with_one_more().sum(-1) - 1
-        needed = np.maximum(F_THRESHOLD * 3 * second / np.maximum(spare, 1.0), self.least_gain * first)
-        return first - second > share * needed
+        needed = np.maximum(F_THRESHOLD * 3 * square_after / np.maximum(spare, 1.0), self.least_gain * square_before)
+        return square_before - square_after > share * needed
 
 
 def _disturbed(measurements: Measurements, residual: Array) -> Array:
     """(B,) bool: a stretch of outliers may have biased a fit, which leaves more than 5 % of the motion of some rows."""
-    most = quantile(measurements.sizes(residual), 0.9, 1)
-    whole = median(measurements.sizes(measurements.displacements), 1)
-    return ~np.all(most < 0.05 * whole, -1)
+    large_residual = quantile(measurements.sizes(residual), 0.9, 1)
+    return ~np.all(large_residual < 0.05 * median(measurements.sizes(measurements.displacements), 1), -1)
 
 
 # of 1 / duration. 80 recordings of two tones on each axis, 0.2 to 0.9 apart: 73 of 160 axes are reliable, the rms of z
@@ -266,7 +265,7 @@ def _resolved(measurements: Measurements, fit: ToneFit) -> Array:
 
 
 def _with_blind_tones(measurements: Measurements, weighted: Measurements, fit: ToneFit, blind: Array) -> ToneFit:
-    """The fit with a tone of a blind frequency in place of its side tones, where that explains no less.
+    """The fit with a tone of a blind frequency in place of its side tones, where that explains as much.
 
     With motion of frequency f_m along the scan, rows are not exactly one frame apart when they are compared. A tone of
     a blind frequency f_b then appears as weak tones at f_b + f_m and |f_b - f_m|. The tone itself, which the verdict
@@ -283,11 +282,10 @@ def _with_blind_tones(measurements: Measurements, weighted: Measurements, fit: T
     distance = np.abs(tone[..., None] - sides) * measurements.span.reshape(-1, 1, 1, 1, 1, 1)
     distance = without_nan(distance, np.inf).min((-2, -1))  # (B, 2, K, F) cycles in the record
     weak = fit.active & (size > 0) & (size < weak_limit[:, None])
-    near = (distance < 1.0) & weak[..., None]
+    is_near = (distance < 1.0) & weak[..., None]
     # 2. For each axis the blind frequency with most side tones, then the nearest.
-    score = near.sum(2) + 0.5 / (1 + distance.min(2))
-    best = score.argmax(-1)  # (B, 2)
-    side = np.take_along_axis(near, best[:, :, None, None], -1)[..., 0]  # (B, 2, K)
+    best = (is_near.sum(2) + 0.5 / (1 + distance.min(2))).argmax(-1)  # (B, 2)
+    side = np.take_along_axis(is_near, best[:, :, None, None], -1)[..., 0]  # (B, 2, K)
     suspected = np.any(side, -1)
     if not bool(suspected.any()):
         return fit
@@ -298,16 +296,16 @@ def _with_blind_tones(measurements: Measurements, weighted: Measurements, fit: T
         frequencies = np.where(place & changed, blind[best][..., None], fit.frequencies)
         return frequencies, fit.active & ~(side & ~place & changed)
 
-    # 3. The tone of this frequency instead of its side tones, kept where it explains no less per parameter.
+    # 3. The tone of this frequency instead of its side tones, accepted where it explains as much per parameter.
     frequencies, active = replaced(suspected)
-    other = fit_tones(weighted, frequencies, active, fit.drift_order)
+    blind_fit = fit_tones(weighted, frequencies, active, fit.drift_order)
     before = weighted.square(residual_of(measurements, fit))
-    after = weighted.square(residual_of(measurements, other))
+    after = weighted.square(residual_of(measurements, blind_fit))
     spare = measurements.num_measurements - 3 * fit.active.sum(-1)
     fewer = 3 * (fit.active.sum(-1) - active.sum(-1))
     better = suspected & (after / np.maximum(spare + fewer, 1.0) <= before / np.maximum(spare, 1.0))
     # frames without motion along the scan contain nothing of a blind tone: its fitted amplitude was 3e16 px
-    better = better & (other.amplitude < np.array(LARGEST)[: size.shape[1], None]).all(-1)
+    better = better & (blind_fit.amplitude < np.array(LARGEST)[: size.shape[1], None]).all(-1)
     if not bool(better.any()):
         return fit
     frequencies, active = replaced(better)
@@ -335,21 +333,21 @@ def significant_only(measurements: Measurements, fit: ToneFit, intervals: Array)
         # 1. The weakest tone of each axis that is neither significant nor needed.
         size, std = fit.amplitude, amplitude_std(fit)
         small = too_small(fit, intervals, measurements.exposure_time)
-        kept = ((size > MIN_SIGNIFICANCE * std) & ~small) | (size == size.max(-1, keepdims=True)) | needed
-        weak = fit.active & ~kept
+        is_kept = ((size > MIN_SIGNIFICANCE * std) & ~small) | (size == size.max(-1, keepdims=True)) | needed
+        weak = fit.active & ~is_kept
         ratio = np.where(weak, size / np.maximum(std, 1e-300), np.inf)
         dropped = (ratio == ratio.min(-1, keepdims=True)) & weak
         if not bool(dropped.any()):
             return fit
         # 2. The fit without it. It is needed if the residual then increases significantly.
-        other = fit_tones(measurements, fit, fit.active & ~dropped)
+        reduced = fit_tones(measurements, fit, fit.active & ~dropped)
         after = measurements.square(residual_of(measurements, fit))
-        before = measurements.square(residual_of(measurements, other))
+        before = measurements.square(residual_of(measurements, reduced))
         spare = measurements.num_measurements - 3 * fit.active.sum(-1)
         worse = before - after > F_THRESHOLD * 3 * after / np.maximum(spare, 1.0)
-        keep = dropped & worse[..., None] & ~small
-        needed = needed | keep
-        if bool(keep.any()):
-            fit = fit_tones(measurements, fit.frequencies, fit.active & ~dropped | keep, fit.drift_order)
+        is_needed = dropped & worse[..., None] & ~small
+        needed = needed | is_needed
+        if bool(is_needed.any()):
+            fit = fit_tones(measurements, fit.frequencies, fit.active & ~dropped | is_needed, fit.drift_order)
         else:
-            fit = other
+            fit = reduced

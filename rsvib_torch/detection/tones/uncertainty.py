@@ -104,8 +104,8 @@ class LinearisedFit:
         jacobian, residual = jacobian[..., axes, :], residual[..., axes]
         spent = (np.square(jacobian).max((1, 2)) > 0).sum((1, 2))
         spare = np.maximum(measurements.num_measurements[:, axes].sum(1) - spent, 1.0)
-        one = measurements.inverse_variances[..., axes, None] if len(axes) == 1 else measurements.information
-        root = cholesky_root(one)
+        information = measurements.inverse_variances[..., axes, None] if len(axes) == 1 else measurements.information
+        root = cholesky_root(information)
         whitened = (root[:, :, None] @ residual[..., None]).reshape(len(residual), -1)
         deviation = np.sqrt(np.maximum(np.square(whitened).sum(1) / spare, 1e-300))[:, None, None, None]
         root = root / deviation
@@ -144,7 +144,7 @@ def linearised(measurements: Measurements, fit: ToneFit) -> list[tuple[int, Line
     jacobian, residual = free_jacobian(measurements, fit), residual_of(measurements, fit)
     axes = range(fit.coefficients.shape[1])
     parts = [[axis] for axis in axes] if len(axes) == 2 else [list(axes)]
-    problems = [LinearisedFit.of_axes(measurements, part, jacobian, residual) for part in parts]
+    problems = [LinearisedFit.of_axes(measurements, axes_of_problem, jacobian, residual) for axes_of_problem in parts]
     return [(axis, problem) for problem in problems for axis in problem.axes]
 
 
@@ -152,7 +152,7 @@ def linearised(measurements: Measurements, fit: ToneFit) -> list[tuple[int, Line
 
 
 def without_aliasing(measurements: Measurements, fit: ToneFit, size: Array) -> ToneFit:
-    """The fit without the error by aliasing of x and y, of expected size (B,) px; what remains is in the covariance."""
+    """The fit corrected for aliasing of x and y, of expected size (B,) px; the covariance has the remaining error."""
     size = np.maximum(size, 1e-9)[:, None]
     covariance, axes = fit.covariance.copy(), fit.drift.shape[1]
     change = np.zeros((len(covariance), axes, covariance.shape[-1] // axes))
@@ -164,10 +164,10 @@ def without_aliasing(measurements: Measurements, fit: ToneFit, size: Array) -> T
         Z, by_unit = problem.unexplained(bias[:, :, :, axis], axis)
         precision = 1 / np.square(size * _BIAS_STD[axis])  # (B, 3), of b, c and s before they are measured
         normal = Z.mT @ Z + (problem.rounding(axis)[:, None] + precision)[..., None] * np.eye(3)
-        right = Z.mT @ problem.residual[..., None] + (precision * size * _MEAN_BIAS[axis])[..., None]
+        right_side = Z.mT @ problem.residual[..., None] + (precision * size * _MEAN_BIAS[axis])[..., None]
         inverse = np.linalg.inv(normal)
         problem.add_covariance(covariance, by_unit @ inverse @ by_unit.mT)
-        problem.add_change(change, -(by_unit @ inverse @ right)[..., 0])
+        problem.add_change(change, -(by_unit @ inverse @ right_side)[..., 0])
     tones, drift = np.split(change, [3 * fit.frequencies.shape[-1]], -1)
     real, imaginary, frequency = np.moveaxis(split_axis(tones, -1, -1, 3), -1, 0)
     return replace(
@@ -206,37 +206,37 @@ def with_unknown_amplitudes(
     small, large = _UNKNOWN_ALIASING
     by_aliasing = aliasing[:, None, None] * np.minimum(small, large / (size + 2 * np.square(size) + 1e-300))
     error[:, known:] = np.hypot(error, by_aliasing)[:, known:]
-    of_error = fit.tones * error[..., None] * [1.0, 1.0, 0.0]  # of Re C, Im C and f
+    error_std = fit.tones * error[..., None] * [1.0, 1.0, 0.0]  # of Re C, Im C and f
     # the bounds of Re C, Im C and f of a tone that is sampled uniformly have these proportions
     common = np.broadcast_to(_UNEXPLAINED_IN_COMMON * without_nan(unexplained, 0.0)[..., None], size.shape)
     per_size = np.divide(common, size, out=np.zeros_like(size), where=fit.active & (size > 0))
-    of_frequency = math.sqrt(12) * per_size / (2 * math.pi * np.reshape(span, (-1, 1, 1)))
-    of_common = np.stack([common, common, of_frequency], -1) * fit.active[..., None]
+    frequency_std = math.sqrt(12) * per_size / (2 * math.pi * np.reshape(span, (-1, 1, 1)))
+    common_std = np.stack([common, common, frequency_std], -1) * fit.active[..., None]
     unknown, in_common = (
         np.pad(values.reshape(*size.shape[:2], -1), ((0, 0), (0, 0), (0, fit.drift.shape[-1])))  # (B, A, P)
-        for values in (of_error, of_common)
+        for values in (error_std, common_std)
     )
     covariance, (axes, parameters) = fit.covariance.copy(), unknown.shape[1:]
     diagonal = np.arange(axes * parameters)
     covariance[:, diagonal, diagonal] += np.square(in_common).reshape(len(covariance), -1)
-    of_axes = covariance.reshape(len(covariance), axes, parameters, axes, parameters)
+    blocks = covariance.reshape(len(covariance), axes, parameters, axes, parameters)
     for axis in range(axes):
-        of_axes[:, axis, :, axis] += unknown[:, axis, :, None] * unknown[:, axis, None]
+        blocks[:, axis, :, axis] += unknown[:, axis, :, None] * unknown[:, axis, None]
     return replace(fit, covariance=covariance)
 
 
-def with_unknown_image_motion(stated: "StatedFit", interval: float, exposure_time: float) -> "StatedFit":
+def with_unknown_image_motion(reported: "ReportedFit", interval: float, exposure_time: float) -> "ReportedFit":
     """The fit with errors of its image motion by blur, which displaces frames ``interval`` s apart by unequal amounts.
 
-    They are not part of the displacement of rows, whose errors are those without image motion.
+    The standard deviation of the displacement does not change: it excludes the image motion.
     """
-    fit, axes = stated.fit, stated.fit.amplitude.shape[1]
+    fit, axes = reported.fit, reported.fit.amplitude.shape[1]
     error = np.array(_DRIFT_BY_BLUR)[:axes] * np.square(_path_within(fit, exposure_time)).sum(-1) / interval  # px/s
     covariance = fit.covariance.copy()
     parameters = covariance.shape[-1] // axes
     velocity = np.arange(axes) * parameters + parameters - fit.drift_order
     covariance[:, velocity, velocity] += np.square(error)
-    return replace(stated, fit=replace(fit, covariance=covariance))
+    return replace(reported, fit=replace(fit, covariance=covariance))
 
 
 def _path_within(fit: ToneFit, exposure_time: float) -> Array:
@@ -248,12 +248,12 @@ def _path_within(fit: ToneFit, exposure_time: float) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class StatedFit:
-    """A fit with the uncertainty that is stated for it."""
+class ReportedFit:
+    """A fit with the uncertainty that results report."""
 
     fit: ToneFit  # the fit with its covariance
     # (B, A) px, standard deviation of the displacement of rows without their mean, rms over the rows; the effect of a
-    # further tone is that without linear trend, which the image motion contains
+    # further tone is computed without linear trend, which the image motion contains
     displacement_std: Array
 
     def vibration(self) -> tuple[Vibration, VibrationStd]:
@@ -264,23 +264,23 @@ class StatedFit:
 
 def with_further_tones(
     measurements: Measurements, fit: ToneFit, exposure_starts: Array, *, number_is_known: bool = False
-) -> tuple[StatedFit, StatedFit]:
+) -> tuple[ReportedFit, ReportedFit]:
     """The fit as it is, and with an allowance for a further tone in its covariance; rows start at (N,) s."""
     rows = np.broadcast_to(exposure_starts, (len(fit.centre), len(exposure_starts)))
-    known = StatedFit(fit, displacement_std(fit, exposure_starts, measurements.exposure_time))
+    reported = ReportedFit(fit, displacement_std(fit, exposure_starts, measurements.exposure_time))
     if number_is_known:
-        return known, known
-    covariance, variance = fit.covariance.copy(), np.square(known.displacement_std)
+        return reported, reported
+    covariance, variance = fit.covariance.copy(), np.square(reported.displacement_std)
     jacobian = displacement_jacobian(fit, rows, measurements.exposure_time)
     for axis, problem in linearised(measurements, fit):
-        added, moved = _added(measurements, fit, axis, problem, rows, jacobian)
+        added, displacement_variance = _added(measurements, fit, axis, problem, rows, jacobian)
         problem.add_covariance(covariance, added)
-        variance[:, problem.axes] += moved
-    return known, StatedFit(replace(fit, covariance=covariance), np.sqrt(variance))
+        variance[:, problem.axes] += displacement_variance
+    return reported, ReportedFit(replace(fit, covariance=covariance), np.sqrt(variance))
 
 
 def _grid(measurements: Measurements, fit: ToneFit, axis: int) -> tuple[Array, Array]:
-    """Frequencies (B, F) in Hz of the further tone of an axis, and those that count (bool): near its tones, or low."""
+    """Frequencies (B, F) in Hz of the further tone of an axis, and whether each is near one of its tones, or low."""
     duration = measurements.span[:, None]
     tones = np.where(fit.active, fit.frequencies, 0.0)[:, axis]  # (B, K)
     centres = np.concatenate([np.zeros_like(tones[:, :1]), tones], 1)
@@ -288,9 +288,9 @@ def _grid(measurements: Measurements, fit: ToneFit, axis: int) -> tuple[Array, A
     reach = np.arange(-_REACH * _POINTS - 1, _REACH * _POINTS + 2)
     places = np.unique((centres * duration * _POINTS).round()[..., None] + reach)
     frequencies = places[places >= 1] / (_POINTS * duration)
-    near = (np.abs(frequencies[..., None] - centres[:, None]) * duration[..., None] <= _REACH).any(-1)
-    used = near.any(0)
-    return frequencies[:, used], near[:, used]
+    is_near = (np.abs(frequencies[..., None] - centres[:, None]) * duration[..., None] <= _REACH).any(-1)
+    is_used = is_near.any(0)
+    return frequencies[:, is_used], is_near[:, is_used]
 
 
 def _added(
@@ -307,8 +307,8 @@ def _added(
     parameters of each axis.
     """
     axes = problem.axes
-    of_displacement = _without_trend(jacobian[:, :, axes], rows)
-    of_axis = np.eye(len(axes))[axes.index(axis)][:, None, None]
+    displacement_jacobian = _without_trend(jacobian[:, :, axes], rows)
+    is_axis = np.eye(len(axes))[axes.index(axis)][:, None, None]
     # 1. Prior of the quadratures: their precision, and the least precision that rounding leaves.
     size = _PRIOR_SIZE * np.sqrt(np.square(fit.amplitude[:, axis]).sum(-1))  # (B,) px
     precision = (1 / np.square(np.where(size > 0, size, 1.0)))[:, None, None, None]
@@ -316,17 +316,17 @@ def _added(
     limit = precision + problem.rounding(axis)[:, None, None, None]
     frequencies, counted = _grid(measurements, fit, axis)
     parts, along = [], measurements.of_axis(axis)
-    for part in runs(frequencies.shape[1], max(1, _CHUNK // (4 * problem.residual.size))):
-        chunk = frequencies[:, part]
+    for batch in runs(frequencies.shape[1], max(1, _CHUNK // (4 * problem.residual.size))):
+        chunk = frequencies[:, batch]
         # 2. Posterior of the quadratures v of a tone of each frequency f, and its evidence; sums over measurements d.
         response = tone_response(along, chunk[:, None])[..., 0, :]
         unexplained = problem.unexplained(_quadratures(response).reshape(*response.shape[:-1], -1), axis)
         Z, back = (split_axis(values, -1, -1, 2) for values in unexplained)
         information = np.einsum("bdfp,bdfq->bfpq", Z, Z)
-        right = np.einsum("bdfq,bd->bfq", Z, problem.residual)
+        right_side = np.einsum("bdfq,bd->bfq", Z, problem.residual)
         C = np.linalg.inv(information + limit * eye)
-        v = (C @ right[..., None])[..., 0]
-        evidence = 0.5 * (right * v).sum(-1) - 0.5 * np.linalg.slogdet(eye + information / precision)[1]
+        v = (C @ right_side[..., None])[..., 0]
+        evidence = 0.5 * (right_side * v).sum(-1) - 0.5 * np.linalg.slogdet(eye + information / precision)[1]
         # 3. Displacement S of the rows by unit tones, and by the change of the parameters p that they cause: mean
         # product over the rows n for each frequency f and axis a.
         time = rows + 0.5 * measurements.exposure_time - fit.centre[:, None]
@@ -334,17 +334,17 @@ def _added(
         attenuation = np.sinc(chunk * measurements.exposure_time)[:, None]
         S = _without_trend(_quadratures(attenuation * waves), rows)
         changes = split_axis(back, 1, len(axes), -1)  # (B, A, P, F, 2)
-        S = S[:, :, None] * of_axis - np.einsum("bnam,bamfq->bnafq", of_displacement, changes, optimize=True)
-        moved = np.einsum("bnafp,bnafq->bfapq", S, S) / S.shape[1]
-        parts.append((evidence, C + v[..., :, None] * v[..., None, :], np.moveaxis(back, 1, 2), moved))
-    evidence, second, back, moved = (np.concatenate(values, 1) for values in zip(*parts, strict=True))
+        S = S[:, :, None] * is_axis - np.einsum("bnam,bamfq->bnafq", displacement_jacobian, changes, optimize=True)
+        displacement_products = np.einsum("bnafp,bnafq->bfapq", S, S) / S.shape[1]
+        parts.append((evidence, C + v[..., :, None] * v[..., None, :], np.moveaxis(back, 1, 2), displacement_products))
+    evidence, second, back, displacement_products = (np.concatenate(values, 1) for values in zip(*parts, strict=True))
     # 4. Probability of a tone of each frequency. One tone more, of any frequency, has the prior probability of none.
     counted = counted & (size > 0)[:, None]
     prior = np.where(counted, -np.log(np.maximum(counted.sum(1, keepdims=True), 1.0)), -math.inf)
     probability = special.softmax(np.pad(evidence + prior, ((0, 0), (1, 0))), -1)[:, 1:]
     # 5. Mean over all frequencies.
-    of_tone = probability[..., None, None] * second
-    return (back @ of_tone @ back.mT).sum(1), (moved * of_tone[:, :, None]).sum((1, 3, 4))
+    tone_moment = probability[..., None, None] * second
+    return (back @ tone_moment @ back.mT).sum(1), (displacement_products * tone_moment[:, :, None]).sum((1, 3, 4))
 
 
 def _quadratures(response: Array) -> Array:
