@@ -268,12 +268,12 @@ class ColumnMotion(Motion, shapes={"column": "..."}):
         raise NotImplementedError("a ColumnMotion stays in row order; exchange the axes of its components")
 
 
-def check_two_axes(motion: Motion, what: str) -> None:
+def check_two_axes(motion: Motion, quantity: str) -> None:
     """Raise a ``ValueError`` for a motion that displaces the columns of a row differently."""
     if not motion.same_for_all_columns:
         raise ValueError(
-            f"{what} is not defined with roll, zoom or a camera, which displace the columns of a row differently; pass "
-            "a motion with the axes (x, y) only"
+            f"{quantity} is not defined with roll, zoom or a camera, which displace the columns of a row differently; "
+            "pass a motion with the axes (x, y) only"
         )
 
 
