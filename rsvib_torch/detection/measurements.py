@@ -198,7 +198,7 @@ class Measurements:
         total, deviation = (weight * product).sum(1), np.sqrt(np.square(weight * product).sum(1))
         return np.sqrt(np.where(total > 1.645 * deviation, total / np.maximum(weight.sum(1), 1e-300), 0.0))
 
-    def of_worst_group(self, residual: Array) -> Array:
+    def worst_group_residual(self, residual: Array) -> Array:
         """(B, 1) px, residual of the typical row of the group of frames that is explained worst, of any axis.
 
         0 unless it is more than ``_WORST`` times that of the typical group. Clouds may cover half of the rows. All
@@ -305,7 +305,7 @@ class OtherMotion:
         share = np.where(num_visible > 0, num_measured / np.maximum(num_visible, 1), 1.0)
         return cls(
             size=size,
-            unexplained=np.maximum(measurements.unexplained(residual), measurements.of_worst_group(residual)),
+            unexplained=np.maximum(measurements.unexplained(residual), measurements.worst_group_residual(residual)),
             correlated=measurements.correlated(residual),
             differential=differential,
             measured=(share * num_visible.any(1, keepdims=True)).min(1),

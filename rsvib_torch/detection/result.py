@@ -195,19 +195,19 @@ def offset_curve(
         for frame in range(frames - 1)
     ]
 
-    def of_pairs(values: Array) -> Array:
+    def pair_values(values: Array) -> Array:
         """Values (B, N, G, ...) of the earlier and the later frame of each pair, (2, B, P, N, ...)."""
         return np.moveaxis(np.stack([values[:, rows, frames] for rows, frames in parts], 1), 3, 0)
 
-    def of_rows(values: Array) -> Array:
+    def row_values(values: Array) -> Array:
         return np.stack([values[:, rows] for rows, _ in parts], 1)
 
-    starts, later_starts = of_pairs(measurements.exposure_starts)
-    before, after = of_pairs(measurements.displacements)
+    starts, later_starts = pair_values(measurements.exposure_starts)
+    before, after = pair_values(measurements.displacements)
     everywhere = replace(measurements, visible=np.ones_like(measurements.visible))
-    fitted_before, fitted_after = of_pairs(model_displacements(everywhere, fit))
-    weights, robust = of_rows(measurements.weights), of_rows(robust_weights)
-    measured = (of_pairs(measurements.visible).min(0) > 0) & (weights > 0).any(-1)
+    fitted_before, fitted_after = pair_values(model_displacements(everywhere, fit))
+    weights, robust = row_values(measurements.weights), row_values(robust_weights)
+    measured = (pair_values(measurements.visible).min(0) > 0) & (weights > 0).any(-1)
     frames = np.arange(len(parts))
     values = {
         "pairs": np.stack([frames, frames + 1], -1),

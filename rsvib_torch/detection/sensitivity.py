@@ -92,8 +92,8 @@ def timing_sensitivity(fit: ToneFit, timing: RowTiming, num_frames: int, num_row
         # the phase at the time origin instead of the middle of the record
         phase_change = np.where(fit.active, along.imag / np.square(size), 0.0)
         phase = phase_change - 2 * math.pi * fit.frequencies * frequency * fit.centre[:, None, None]
-        for of, change in (("amplitude", amplitude), ("frequency", frequency), ("phase", phase)):
-            values[f"{of}_by_{name}"] = torch.from_numpy(np.take_along_axis(change, largest_first, -1))
+        for quantity, change in (("amplitude", amplitude), ("frequency", frequency), ("phase", phase)):
+            values[f"{quantity}_by_{name}"] = torch.from_numpy(np.take_along_axis(change, largest_first, -1))
     return TimingSensitivity(**values)
 
 
@@ -104,7 +104,7 @@ def with_row_time_std(
     if not timing.row_time_std:
         return std
     by_row_time, by_frame_rows, by_exposure_rows = (
-        torch.stack([getattr(sensitivity, f"{of}_by_{time}") for of in ("amplitude", "frequency", "phase")])
+        torch.stack([getattr(sensitivity, f"{quantity}_by_{time}") for quantity in ("amplitude", "frequency", "phase")])
         for time in ("row_time", "frame_rows", "exposure_rows")
     )
     relative = timing.row_time_std / timing.row_time
@@ -173,7 +173,7 @@ def assumptions(
         times.insert(0, settings.partition(",")[0])
     # 2. Effects on the tones of each stack.
     amplitudes, frequencies = tables(vibration.amplitude, vibration.frequency)
-    changes = {name: tables(*(getattr(sensitivity, f"{of}_by_{name}") for of in _TONE_VALUES)) for name in times}
+    changes = {name: tables(*(getattr(sensitivity, f"{value}_by_{name}") for value in _TONE_VALUES)) for name in times}
     sentences_of_stacks = []
     for stack, frequency in enumerate(frequencies):
         tones = [(axis, tone, float(frequency[axis, tone])) for axis, tone in np.argwhere(amplitudes[stack] > 0)]
@@ -216,7 +216,7 @@ def _effects(name: str, tones: _Tones, changes: list[Array], timing: RowTiming) 
     tone_texts = []
     for axis, tone, frequency in tones:
         tone_changes = zip(_TONE_VALUES, (change[axis, tone] for change in changes), strict=True)
-        texts = [f"{of} {change:+.2g} %" for of, change in tone_changes if abs(change) > 0.1]
+        texts = [f"{quantity} {change:+.2g} %" for quantity, change in tone_changes if abs(change) > 0.1]
         if texts:
             tone_texts.append(f"{AXIS_NAMES[axis]} {frequency:.4g} Hz: {', '.join(texts)}")
     setting = f"{name}={getattr(timing, name):g}"

@@ -104,15 +104,15 @@ def combined_strips(measured: Measurements, factors: Array) -> Measurements:
     """Components (B, N, G, A) of rows from displacements (B S, N, G, 2) of strips by ``factors`` (B, S, N, 2, A)."""
     strips = factors.shape[1]
 
-    def of_strips(values: Array) -> Array:
+    def by_strip(values: Array) -> Array:
         return split_axis(values, 0, -1, strips)
 
     # 1. Displacements relative to the frames in which all strips of a row are visible.
-    visible = of_strips(measured.visible).min(1)
+    visible = by_strip(measured.visible).min(1)
     everywhere = replace(measured, visible=np.repeat(visible, strips, 0))
-    displacements = of_strips(everywhere.relative(measured.displacements))  # (B, S, N, G, 2)
+    displacements = by_strip(everywhere.relative(measured.displacements))  # (B, S, N, G, 2)
     # 2. The normal equations of the components of every row, in units of their sizes.
-    weighted = of_strips(measured.information) @ factors
+    weighted = by_strip(measured.information) @ factors
     information = (factors.mT @ weighted).sum(1)  # (B, N, A, A)
     right_side = np.einsum("bsnia,bsngi->bnga", weighted, displacements)
     size = information.diagonal(axis1=-2, axis2=-1)
@@ -125,7 +125,7 @@ def combined_strips(measured: Measurements, factors: Array) -> Measurements:
     unit = unit[:, :, None]
     components = np.where(regular[:, :, None, None], ((right_side * unit) @ inverse) * unit, 0.0)
     return Measurements(
-        of_strips(measured.exposure_starts).mean(1),
+        by_strip(measured.exposure_starts).mean(1),
         components,
         visible,
         np.where(regular[..., None, None], information, 0.0),

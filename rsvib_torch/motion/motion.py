@@ -212,7 +212,7 @@ class ColumnMotion(Motion, shapes={"column": "..."}):
         heights, _ = torch.broadcast_tensors(row - 0.5 * (self.num_rows - 1), components[..., 0])
         return torch.as_tensor(heights)
 
-    def _moved(self, starts: Tensor, components: Tensor) -> Tensor:
+    def _content_displacement(self, starts: Tensor, components: Tensor) -> Tensor:
         """Displacement (S, 2) of the content of rows exposed from ``starts`` (S) on, by components (S, A)."""
         height, camera = self._heights(starts, components), self.components.camera
         x = self.column[(..., *(None,) * (height.ndim - self.column.ndim))].expand_as(height)
@@ -228,17 +228,17 @@ class ColumnMotion(Motion, shapes={"column": "..."}):
     def displacement(self, times: Tensor) -> Tensor:
         """Displacement in px of the rows that begin their exposure at these times."""
         times = times.to(dtype=torch.float64, device=self.device)
-        return self._moved(times, self.components.displacement(times))
+        return self._content_displacement(times, self.components.displacement(times))
 
     def path(self, starts: Tensor, delays: Tensor) -> Tensor:
         """Displacement in px during exposures, as ``Motion.path``: a row keeps its position in the frame."""
         starts = starts.to(dtype=torch.float64, device=self.device)
-        return self._moved(starts[..., None], self.components.path(starts, delays))
+        return self._content_displacement(starts[..., None], self.components.path(starts, delays))
 
     def mean_displacement(self, starts: Tensor, exposure_time: float | Tensor) -> Tensor:
         """Mean displacement over exposures in px."""
         starts = starts.to(dtype=torch.float64, device=self.device)
-        return self._moved(starts, self.components.mean_displacement(starts, exposure_time))
+        return self._content_displacement(starts, self.components.mean_displacement(starts, exposure_time))
 
     def drift(self, times: Tensor) -> Tensor:
         """Drift of X and Y in px, the same for all columns; that of roll and zoom counts as oscillation."""
@@ -268,12 +268,12 @@ class ColumnMotion(Motion, shapes={"column": "..."}):
         raise NotImplementedError("a ColumnMotion stays in row order; exchange the axes of its components")
 
 
-def check_two_axes(motion: Motion, what: str) -> None:
+def check_two_axes(motion: Motion, quantity: str) -> None:
     """Raise a ``ValueError`` for a motion that displaces the columns of a row differently."""
     if not motion.same_for_all_columns:
         raise ValueError(
-            f"{what} is not defined with roll, zoom or a camera, which displace the columns of a row differently; pass "
-            "a motion with the axes (x, y) only"
+            f"{quantity} is not defined with roll, zoom or a camera, which displace the columns of a row differently; "
+            "pass a motion with the axes (x, y) only"
         )
 
 

@@ -119,7 +119,7 @@ class CornerFollower:
         agrees = np.hypot(*(ends - corners).T) < _AT_REST
         if not _stands_still(corners, agrees, second.shape):
             axis = 1 if timing.scan_axis == -2 else 0
-            agrees = _agreeing(corners, ends, axis, second.shape[1 - axis], scale)
+            agrees = _agreement(corners, ends, axis, second.shape[1 - axis], scale)
             least = min(_MIN_SHARE * len(followed), _MIN_FOLLOWED * len(corners))
             if agrees.sum() < max(_MIN_CORNERS, least):
                 return None
@@ -143,7 +143,7 @@ def rows_of_points(points: Array, timing: SensorTiming, size: tuple[int, ...]) -
     return rows if timing.readout_direction == "forward" else size[1 - axis] - 1 - rows
 
 
-def _agreeing(corners: Points, ends: Points, axis: int, length: int, scale: int) -> NDArray[np.bool_]:
+def _agreement(corners: Points, ends: Points, axis: int, length: int, scale: int) -> NDArray[np.bool_]:
     """(N,) bool, whether corners move with most others of their rows, along ``axis`` of ``length``."""
     agrees = np.zeros(len(corners), bool)
     if len(corners) < _MIN_CORNERS:
@@ -171,7 +171,7 @@ def _in_layer(corners: Points, ends: Points, votes: NDArray[np.int64], scale: in
     # 1. The corners that decide: those that moved with the layer last, else those that did not move apart from it. A
     # subject moves with the layer for a moment, and apart from it later.
     least = max(_MIN_CORNERS, _MIN_SHARE * len(votes))
-    decide = next((of for of in (votes > 0, votes >= 0) if of.sum() >= least), np.ones(len(corners), bool))
+    decide = next((mask for mask in (votes > 0, votes >= 0) if mask.sum() >= least), np.ones(len(corners), bool))
     # 2. The motion of the layer, and the corners that move like it.
     for limit in _LAYER_LIMITS / scale:
         similarity, inside = cv2.estimateAffinePartial2D(corners[decide], ends[decide], ransacReprojThreshold=limit)

@@ -95,7 +95,7 @@ def row_gradients(
             first; the derivatives by all of them are regressors. None if the displacement depends on the row only.
     """
     (batch, frames, count), (width, length) = visible.shape, size
-    mean, noise, different = _compared(warp, runs, visible)
+    mean, noise, different = _compare(warp, runs, visible)
     detail, along, across, aliasing = _scene_detail(mean, noise, length)
     inner = functional.pad(inner_columns(width, shift, detail.real), (0, length - width))
     parts = chunks(count, 4 * length * batch * (4 + frames), visible.device, multiple=BLOCK)
@@ -159,11 +159,11 @@ def residual_products(
     """``RowGradients.residual_products`` of other frames, or of a similar motion; arguments as in ``row_gradients``."""
     length = gradients.images.shape[-1]
 
-    def of_run(rows: slice) -> Tensor:
+    def products_of_run(rows: slice) -> Tensor:
         pixels = torch.fft.irfft(differences(warp(rows), visible[:, :, rows]).transpose(1, 2), n=length)
         return torch.matmul(gradients.images[:, rows], pixels.transpose(-2, -1))
 
-    return torch.cat(in_parallel(of_run, runs, visible.device), 1).double()
+    return torch.cat(in_parallel(products_of_run, runs, visible.device), 1).double()
 
 
 def row_equations(products: Tensor, gradients: RowGradients, visible: Tensor) -> tuple[Tensor, Tensor]:
@@ -299,18 +299,18 @@ def _quarters(sums: Tensor, solution: Tensor, visible: Tensor) -> Tensor:
     return torch.cat([products, change], dim=-1) * (visible[:, 0] * visible[:, -1])[..., None, None]
 
 
-def _compared(warp: Callable[[slice], Tensor], runs: list[slice], visible: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _compare(warp: Callable[[slice], Tensor], runs: list[slice], visible: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Mean (B, R, U) of warped frames, its noise (B, R, U / 4) and their ``differences``, spectra along S scene rows.
 
     R - S rows of zeros follow, so that transforms across rows are fast. Every fourth frequency gives the noise.
     """
 
-    def of_run(rows: slice) -> tuple[Tensor, Tensor, Tensor]:
+    def compare_run(rows: slice) -> tuple[Tensor, Tensor, Tensor]:
         warped, part_visible = warp(rows), visible[:, :, rows]
         noise = _noise_of_mean(warped[..., ::_NOISE_STEP], part_visible)
         return mean_over_frames(warped, part_visible), noise, differences(warped, part_visible)
 
-    means, noises, different = zip(*in_parallel(of_run, runs, visible.device), strict=True)
+    means, noises, different = zip(*in_parallel(compare_run, runs, visible.device), strict=True)
     missing = fast_length(visible.shape[2]) - visible.shape[2]
     mean, noise = (
         torch.cat([*parts, parts[0].new_zeros(len(visible), missing, parts[0].shape[-1])], 1)

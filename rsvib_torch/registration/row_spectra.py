@@ -229,7 +229,7 @@ def column_pattern(groups: list[tuple[RowSpectra, Tensor, Tensor, Tensor, Tensor
     correlation, power, energy, count = (torch.zeros((), dtype=torch.float32, device="cpu") for _ in range(4))
     stacks = len(groups[0][0].values)
 
-    def of_stacks(values: Tensor) -> Tensor:
+    def stack_sums(values: Tensor) -> Tensor:
         """Sums (B, ...) over the groups of each stack of values (B M, ...)."""
         return torch.stack(values.tensor_split(stacks)).sum(1)
 
@@ -244,10 +244,10 @@ def column_pattern(groups: list[tuple[RowSpectra, Tensor, Tensor, Tensor, Tensor
             pixels = torch.fft.irfft(differences(warped, visible[..., run]), n=spectra.length)
             difference = torch.fft.rfft(pixels[..., : spectra.width] * inner, n=spectra.length)
             regressor = differences(ramp, visible[..., run])
-            correlation = correlation + of_stacks((regressor.conj() * difference).sum((1, 2)))
-            power = power + of_stacks(squared_modulus(regressor).sum((1, 2)))
-            energy = energy + of_stacks(squared_modulus(difference).sum((1, 2)))
-        count = count + of_stacks(visible.sum((1, 2)) - (visible.sum(1) > 0).sum(-1)).to(energy.dtype)[:, None]
+            correlation = correlation + stack_sums((regressor.conj() * difference).sum((1, 2)))
+            power = power + stack_sums(squared_modulus(regressor).sum((1, 2)))
+            energy = energy + stack_sums(squared_modulus(difference).sum((1, 2)))
+        count = count + stack_sums(visible.sum((1, 2)) - (visible.sum(1) > 0).sum(-1)).to(energy.dtype)[:, None]
     pattern = correlation / power.clamp(min=1e-6)
     # power of the pattern over that of its noise, a mean over 17 neighbouring frequencies; 3 is beyond chance
     strength = pattern.abs().square() * power / (energy / count.clamp(min=1.0)).clamp(min=1e-30)

@@ -156,7 +156,7 @@ def measure_group(
         products = gradients.residual_products
     else:
         products = residual_products(warp, runs_of_rows, gradients, visible)
-    return _measured(group, timing, motion, positions.exposure_starts, visible, gradients, products), gradients
+    return _measured_group(group, timing, motion, positions.exposure_starts, visible, gradients, products), gradients
 
 
 def measure_strips(
@@ -179,10 +179,10 @@ def measure_strips(
     margin = reach_of_blur(spectra.height, timing, strip_motion)
     positions = Positions.of(group.starts, spectra.height, timing, strip_motion, margin=margin)
 
-    def over_strips(values: Tensor) -> Tensor:
+    def by_strip(values: Tensor) -> Tensor:
         return values.unflatten(0, (-1, count))
 
-    visible = over_strips(positions.visible(spectra.height, BLOCK_ROWS)).amin(1)
+    visible = by_strip(positions.visible(spectra.height, BLOCK_ROWS)).amin(1)
     warp = warp_to_scene(spectra, positions, timing, strip_motion)
     runs_of_rows = spectra.runs(positions.rows.shape[-1], 2)
     length = fast_length(strips.frame_width + 64)
@@ -194,10 +194,10 @@ def measure_strips(
     if gradients is None:
         valid = spectra.warped_valid(positions.rows, positions.shift)
         x = torch.arange(length, device=visible.device) - 0.5 * (strips.frame_width - 1)
-        x = x - over_strips(positions.columns)[:, 0]  # (B, 1, L)
-        y = over_strips(positions.scene_rows)[:, 0, 0, :, None] - 0.5 * (spectra.height - 1)
+        x = x - by_strip(positions.columns)[:, 0]  # (B, 1, L)
+        y = by_strip(positions.scene_rows)[:, 0, 0, :, None] - 0.5 * (spectra.height - 1)
         # a lens may displace invisible rows by any amount
-        largest_shift = over_strips(positions.shift).abs().amax(1) * (visible > 0)
+        largest_shift = by_strip(positions.shift).abs().amax(1) * (visible > 0)
         gradients = row_gradients(
             joined,
             runs_of_rows,
@@ -210,8 +210,8 @@ def measure_strips(
         products = gradients.residual_products
     else:
         products = residual_products(joined, runs_of_rows, gradients, visible)
-    starts = over_strips(positions.exposure_starts).mean(1)
-    return _measured(group, timing, motion, starts, visible, gradients, products), gradients
+    starts = by_strip(positions.exposure_starts).mean(1)
+    return _measured_group(group, timing, motion, starts, visible, gradients, products), gradients
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,7 +224,7 @@ class MeasuredGroup:
     information: Tensor  # (B, N, A, A) px^-2
 
 
-def _measured(
+def _measured_group(
     group: FrameGroups,
     timing: RowTiming,
     motion: Motion,
@@ -234,7 +234,7 @@ def _measured(
     products: Tensor,
 ) -> MeasuredGroup:
     """Measurements of blocks of rows (B M, G, S) around a motion (B M) from ``RowGradients.residual_products``."""
-    residual, information = _solved(*row_equations(products, gradients, visible))
+    residual, information = _block_solutions(*row_equations(products, gradients, visible))
     exposure_starts = _in_blocks(exposure_starts).mean(3)
     # a fit of frames with a wrong timing may place rows at any distance; they are invisible, but their times would make
     # the record, and with it the frequency grid, as long (18 GB)
@@ -243,19 +243,19 @@ def _measured(
     exposure_starts = exposure_starts.clamp(frame_starts - height_time, frame_starts + 2 * height_time)
     around = motion.mean_displacement(exposure_starts, timing.exposure_time)
     return MeasuredGroup(
-        exposure_starts=_of_stacks(exposure_starts.transpose(1, 2), group.count),
-        displacements=_of_stacks((around + residual).transpose(1, 2), group.count),
-        visible=_of_stacks(_in_blocks(visible)[..., 0].transpose(1, 2), group.count),
-        information=_of_stacks(information, group.count),
+        exposure_starts=_by_stack(exposure_starts.transpose(1, 2), group.count),
+        displacements=_by_stack((around + residual).transpose(1, 2), group.count),
+        visible=_by_stack(_in_blocks(visible)[..., 0].transpose(1, 2), group.count),
+        information=_by_stack(information, group.count),
     )
 
 
-def _of_stacks(values: Tensor, groups: int) -> Tensor:
+def _by_stack(values: Tensor, groups: int) -> Tensor:
     """Values (B M, N, ...) of M groups of each stack as (B, M N, ...)."""
     return values.unflatten(0, (-1, groups)).flatten(1, 2)
 
 
-def _solved(information: Tensor, right_side: Tensor) -> tuple[Tensor, Tensor]:
+def _block_solutions(information: Tensor, right_side: Tensor) -> tuple[Tensor, Tensor]:
     """Displacements (B, G, N, A) of blocks and their information (B, N, A, A); both 0 if rows do not determine them."""
     information = _in_blocks(information[:, None]).sum(3)[:, 0]
     right_side = _in_blocks(right_side).sum(3)
@@ -353,7 +353,7 @@ def _rms_of_contrasts(
         excess = (contrast.square() - variance).sum(2)
         values = torch.cat([excess, 2 * variance.square().sum(2)], -1)  # and the variance of the excess
         values = torch.where(regular[..., None], values, torch.nan)
-        estimates.append(_of_stacks(values, len(values) // stacks))
+        estimates.append(_by_stack(values, len(values) // stacks))
     blocks = table(torch.cat(estimates, 1))
     mean_excess, mean_variance = np.split(trimmed_mean(blocks), 2, -1)
     count = np.maximum((~np.isnan(blocks[..., :2])).sum(1), 1)
@@ -469,7 +469,7 @@ def _products_of_blur(group: FrameGroups, timing: RowTiming, motion: Motion) -> 
     values = values * inner[:, :, None, None].to(values.dtype)
     row_products = (values @ values.mT).double()  # (B M, G - 1, S, 3, 3)
     sums = row_products, weight, inner.mean(-1), second.abs().amax((2, 3, 4))
-    row_products, weight, share, moment = (_of_stacks(values, group.count) for values in sums)
+    row_products, weight, share, moment = (_by_stack(values, group.count) for values in sums)
     row_products *= weight[..., None, None]
     length = min(_SCATTER_ROWS // block, row_products.shape[2])
     part_products = row_products[:, :, : row_products.shape[2] // length * length].unflatten(2, (-1, length)).sum(3)

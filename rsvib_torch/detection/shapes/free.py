@@ -293,10 +293,10 @@ def record_of(stack: GreyFrames, timing: RowTiming) -> tuple[float, float]:
 
 def residual_of_motion(measured: Measurements, motion: Motion) -> Array:
     """Residual displacements (1, N, G, 2) in px of a motion (not a batch, on the CPU)."""
-    return measured.relative(measured.displacements - _moved(measured, motion))
+    return measured.relative(measured.displacements - _row_displacements(measured, motion))
 
 
-def _moved(measured: Measurements, motion: Motion) -> Array:
+def _row_displacements(measured: Measurements, motion: Motion) -> Array:
     """Displacements (1, N, G, A) in px of the rows by a motion, means over the exposure and the rows of a band."""
     starts, duration = tensor(measured.exposure_starts), measured.average_times[1]
     nodes, shares = gauss_legendre(3 if duration else 1)
@@ -453,7 +453,7 @@ def _report(
     # 1. Standard deviations, with the motion that is too fast for the knots, which neither spline nor tones contain.
     value, residual = motion.displacement(times), residual_of_motion(measured, motion)
     value = value - value.mean((0, 1))
-    sudden = tensor(_sudden(measured, residual, table(times), motion.spacing))
+    sudden = tensor(_sudden_motion(measured, residual, table(times), motion.spacing))
     unseen, excess = tensor(spread.unseen), tensor(measured.unexplained(residual)[0])
     known_std = torch.hypot(tensor(spread.seen), sudden.square().mean((0, 1)).sqrt())
     std, std_seen = torch.hypot(tensor(spread.of_rows), torch.hypot(sudden, excess)), torch.hypot(known_std, excess)
@@ -533,7 +533,7 @@ def _nearly_blind(motion: FreeMotion, times: Tensor, timing: SensorTiming) -> li
 _SUDDEN = 6.0
 
 
-def _sudden(measured: Measurements, residual: Array, times: Array, spacing: float) -> Array:
+def _sudden_motion(measured: Measurements, residual: Array, times: Array, spacing: float) -> Array:
     """(T, R, A) px, rms residuals (1, N, G, A) within a ``spacing`` in s of times (T, R), where large; 0 elsewhere."""
     visible = measured.visible[0] > 0
     sample_times = (measured.exposure_starts[0] + 0.5 * measured.exposure_time)[visible]

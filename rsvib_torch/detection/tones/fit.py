@@ -167,7 +167,7 @@ class _Problem:
         self.drift_columns = np.broadcast_to(drifts, (*drifts.shape[:3], self.axes, drift_order))
         self.root = measurements.root[:, :, None]  # (B, N, 1, A, A)
 
-    def of_stacks(self, index: Array) -> "_Problem":
+    def stacks_at(self, index: Array) -> "_Problem":
         """The problem of some stacks."""
         selection = copy(self)
         selection.measurements = take_stacks([self.measurements], index)
@@ -282,7 +282,7 @@ class _Problem:
                 (ended,), (index,) = converged.nonzero(), (~converged).nonzero()
                 finished.append(take_stacks([state], ended))
                 order.append(stacks[ended])
-                problem, state = problem.of_stacks(index), take_stacks([state], index)
+                problem, state = problem.stacks_at(index), take_stacks([state], index)
                 stacks, step, damping = stacks[index], step[index], damping[index]
             trial = problem.evaluate(problem.moved(state.values, step))
             curved = (trial.cost > state.cost) & problem.is_lone_and_resolved(trial.values)

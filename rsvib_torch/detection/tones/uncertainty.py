@@ -273,7 +273,7 @@ def with_further_tones(
     covariance, variance = fit.covariance.copy(), np.square(reported.displacement_std)
     jacobian = displacement_jacobian(fit, rows, measurements.exposure_time)
     for axis, problem in linearised(measurements, fit):
-        added, displacement_variance = _added(measurements, fit, axis, problem, rows, jacobian)
+        added, displacement_variance = _further_tone_effect(measurements, fit, axis, problem, rows, jacobian)
         problem.add_covariance(covariance, added)
         variance[:, problem.axes] += displacement_variance
     return reported, ReportedFit(replace(fit, covariance=covariance), np.sqrt(variance))
@@ -293,7 +293,7 @@ def _grid(measurements: Measurements, fit: ToneFit, axis: int) -> tuple[Array, A
     return frequencies[:, is_used], is_near[:, is_used]
 
 
-def _added(
+def _further_tone_effect(
     measurements: Measurements,
     fit: ToneFit,
     axis: int,
