@@ -220,8 +220,11 @@ class Refinement:
         self._sizes = [] if number == self.search_round else [*self._sizes, size]  # fewer tones before the search
 
         # 2. Fit the motion to them, and keep the last fit of a stack whose fit diverges.
-        fit = self._searched(measurements, residual) if number == self.search_round else None
-        if fit is None:
+        if number == self.search_round:  # the noise of rows is nearly white: a further tone that explains 2 % counts
+            scaled = replace(measurements, independent=measurements.independent_fraction(residual))
+            start = with_best_aliases(scaled, strongest_only(self.fit))
+            fit = find_tones(scaled, self._sample_interval, self._tones, start.drift_order, 0.02, start, self._blind)
+        else:
             tones = previous.frequencies, previous.active, previous.drift_order
             fit = robust_fit(measurements, *tones, residual, steps=1)[0]
         fit = self.fit = self._bounded(fit, previous)
@@ -301,12 +304,6 @@ class Refinement:
             fit=replace(fit, covariance=fit.covariance + covariance),
             unknown=covariance,
         )
-
-    def _searched(self, measurements: Measurements, residual: Array) -> ToneFit:
-        """Fit with further tones. The noise of rows is nearly white: a tone that explains 2 % is significant."""
-        independent = replace(measurements, independent=measurements.independent_fraction(residual))
-        start = with_best_aliases(independent, strongest_only(self.fit))
-        return find_tones(independent, self._sample_interval, self._tones, start.drift_order, 0.02, start, self._blind)
 
     def _bounded(self, fit: ToneFit, previous: ToneFit) -> ToneFit:
         """The fit, with the previous one for stacks whose fit diverges."""

@@ -122,13 +122,6 @@ def bspline_coefficients(samples: Tensor, degree: int, dim: int) -> Tensor:
     return correlated(samples.index_select(dim, index), kernel, dim)[0]
 
 
-def _toeplitz(kernels: Tensor, rows: int, step: int = 1) -> Tensor:
-    """Matrix (..., rows, (rows - 1) step + N) whose product with samples is their correlation with kernels (..., N)."""
-    reach = (rows - 1) * step
-    windows = torch.nn.functional.pad(kernels, (reach, reach)).unfold(-1, reach + kernels.shape[-1], step)
-    return windows.flip(-2)
-
-
 def correlated(samples: Tensor, kernels: Tensor, dim: int, step: int = 1) -> Tensor:
     """Correlate along an axis with several kernels, at places where these lie inside ("valid").
 
@@ -143,8 +136,9 @@ def correlated(samples: Tensor, kernels: Tensor, dim: int, step: int = 1) -> Ten
     length = (rows.shape[-2] - taps) // step + 1
     # 1. Blocks of values, by a batch of products with one matrix (Q, block, span).
     block = min(max(1, 32 // step) if samples.device.type == "cpu" else 256, length)
-    span, count = (block - 1) * step + taps, length // block
-    matrix = _toeplitz(kernels, block, step)
+    reach, count = (block - 1) * step, length // block
+    span = reach + taps
+    matrix = torch.nn.functional.pad(kernels, (reach, reach)).unfold(-1, span, step).flip(-2)
     windows = rows.unfold(-2, span, block * step).mT  # (..., count, span, W)
     flat = windows.reshape(-1, *windows.shape[-2:])
     products = torch.bmm(matrix.reshape(1, -1, span).expand(len(flat), -1, -1), flat)

@@ -58,18 +58,17 @@ class RecordedRotation:
         They turn by half of the rotation from frame to frame: displacements S and T of neighbouring frames, whose
         rotation is R, have the rotation ``R + T - S`` between them then, without ``(S + T) x R / 2``.
         """
-        halves = Rotation.from_rotvec(0.5 * self._steps)
-        return Rotation.concatenate([*accumulate(halves, operator.mul, initial=Rotation.identity())])
+        return Rotation.concatenate([*accumulate(self._steps**0.5, operator.mul, initial=Rotation.identity())])
 
     @cached_property
-    def _steps(self) -> Array:
-        """(N - 1, 3) rotation vectors from frame to frame."""
-        return (self.orientations[:-1].inv() * self.orientations[1:]).as_rotvec()
+    def _steps(self) -> Rotation:
+        """(N - 1) rotations from frame to frame."""
+        return self.orientations[:-1].inv() * self.orientations[1:]
 
     @property
     def path(self) -> Array:
         """(N, 3) px at the focal length, sums of the rotation vectors from frame to frame."""
-        summed = np.cumsum(self._axes[:-1].apply(self._steps), 0)
+        summed = np.cumsum(self._axes[:-1].apply(self._steps.as_rotvec()), 0)
         return self.camera.focal_length * np.concatenate([np.zeros((1, 3)), summed])
 
     def of_frames(self, shifts: Array) -> Array:

@@ -221,8 +221,10 @@ class _Search:
         fit, weighted = self.refitted(rough[0].frequencies, active, rough[1])
         if not self.stretches:
             return fit, weighted
-        after = residual_of(self.measurements, fit)
-        disturbed = _disturbed(self.measurements, after) & self.is_inexact(after).any(-1)
+        after, sizes = residual_of(self.measurements, fit), self.measurements.sizes
+        # (B,) bool: a stretch of outliers may have biased a fit, which leaves more than 5 % of the motion of some rows
+        is_explained = quantile(sizes(after), 0.9, 1) < 0.05 * median(sizes(self.measurements.displacements), 1)
+        disturbed = ~is_explained.all(-1) & self.is_inexact(after).any(-1)
         if not bool(disturbed.any()):
             return fit, weighted
         rough = self.candidate(residual, active, leave_out=True)
@@ -245,12 +247,6 @@ class _Search:
         spare = self.measurements.num_measurements - 3 * self.with_one_more().sum(-1) - 1
         needed = np.maximum(F_THRESHOLD * 3 * square_after / np.maximum(spare, 1.0), self.least_gain * square_before)
         return square_before - square_after > share * needed
-
-
-def _disturbed(measurements: Measurements, residual: Array) -> Array:
-    """(B,) bool: a stretch of outliers may have biased a fit, which leaves more than 5 % of the motion of some rows."""
-    large_residual = quantile(measurements.sizes(residual), 0.9, 1)
-    return ~np.all(large_residual < 0.05 * median(measurements.sizes(measurements.displacements), 1), -1)
 
 
 # of 1 / duration. 80 recordings of two tones on each axis, 0.2 to 0.9 apart: 73 of 160 axes are reliable, the rms of z
