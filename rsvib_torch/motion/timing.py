@@ -50,7 +50,7 @@ class SensorTiming:
     """Timing of a rolling-shutter sensor (Liu et al. 2023, Figure 1).
 
     Row ``i`` of frame ``p`` starts its exposure at ``frame_start(p) + i row_time``, with
-    ``frame_start(p) = p frame_rows row_time`` unless ``frame_start_times`` says otherwise, and is exposed for
+    ``frame_start(p) = p frame_rows row_time`` unless ``frame_start_times`` states otherwise, and is exposed for
     ``exposure_rows row_time``. Row 0 is the row that is read first. The three times have no defaults, since they
     cannot be guessed: ``frame_rows`` counts blanking rows and is not the image height.
 

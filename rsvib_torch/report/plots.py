@@ -114,7 +114,7 @@ def _legend_below(figure: Figure, *symbols: Line2D) -> None:
     figure.legend(handles=symbols, loc="outside lower center", ncols=len(symbols), fontsize=9.5, frameon=False)
 
 
-_MOST_PAIRS = 12  # pairs of frames whose curves can be told apart on 6 inches
+_MOST_PAIRS = 12  # pairs of frames whose curves can be distinguished on 6 inches
 _SHOWN_PAIRS = 8
 
 
