@@ -276,7 +276,7 @@ def _posteriors(matrix: Array, right: Array, lsf: Array, fades: Array, contrast:
 
     ``fades`` (D, 1 + K) are standard deviations of the heights at strength 1.
     """
-    edge, rest, found, best = slice(None, PARAMETERS), slice(PARAMETERS, None), [], -math.inf
+    edge, rest, posteriors, best = slice(None, PARAMETERS), slice(PARAMETERS, None), [], -math.inf
     for shading in _SHADINGS:
         # elimination of edge and sides
         precision = matrix[edge, edge].copy()
@@ -302,8 +302,8 @@ def _posteriors(matrix: Array, right: Array, lsf: Array, fades: Array, contrast:
                 root, heights = modes * np.sqrt(shrunk), modes @ (shrunk * projected)
                 moved = start + follow @ heights
                 of_shape = np.block([[follow[BLUR] @ root, free[BLUR]], [root, np.zeros((len(root), PARAMETERS))]])
-                found.append(_Posterior(total, moved, np.append(moved[BLUR], heights), of_shape, lsf))
-    return found
+                posteriors.append(_Posterior(total, moved, np.append(moved[BLUR], heights), of_shape, lsf))
+    return posteriors
 
 
 def _fit_spread(edge: Edge, room: float) -> tuple[Edge, float, Array, list[_Posterior]]:

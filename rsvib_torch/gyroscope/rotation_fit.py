@@ -281,8 +281,8 @@ def _weighed(fit: RotationFit, linear: _Linear, of_effects: Tensor, follows: Ten
     off, along = linear.residual.unbind(-1)
     old, used, is_still = fit.errors, fit.errors.weight > 0, fit.errors.depth == 0  # still: without a translation
     # 1. Corners: the median is not sensitive to those that move by themselves.
-    both = linear.residual[used].abs() if is_still else off[used].abs()
-    sigma = max(1.4826 * float(both.median()), _LEAST_STD)
+    lengths = linear.residual[used].abs() if is_still else off[used].abs()
+    sigma = max(1.4826 * float(lengths.median()), _LEAST_STD)
     weight = follows * _biweight(off / sigma)
     # 2. Depths, from what the residuals along the lines have beyond sigma.
     used = weight > 0
@@ -328,9 +328,9 @@ def fit_robustly(model: RotationModel, start: Tensor) -> RotationFit:
     moving = _weighted(replace(fit, translation=size * _half_sphere()[best], errors=errors), follows)
     # 3. A translation must explain more than noise, as it has a part of every rotation: across its lines.
     line = moving.parallax()
-    rest = tracks.offsets - model.predicted(still.parameters)
-    rest = rest - (_residuals(still)[2] @ still.effects[tracks.pair, :3, None])[..., 0]
-    off = (rest[:, 0] * line[:, 1] - rest[:, 1] * line[:, 0]) / line.norm(dim=-1).clamp(min=1e-9)
+    unexplained = tracks.offsets - model.predicted(still.parameters)
+    unexplained = unexplained - (_residuals(still)[2] @ still.effects[tracks.pair, :3, None])[..., 0]
+    off = (unexplained[:, 0] * line[:, 1] - unexplained[:, 1] * line[:, 0]) / line.norm(dim=-1).clamp(min=1e-9)
     across = 1.4826 * float(off[still.errors.weight > 0].abs().median())
     simpler = across < (1 + _SIGNIFICANT / len(off) ** 0.5) * moving.errors.sigma
     fit = still if simpler else moving

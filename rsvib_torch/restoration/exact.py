@@ -269,14 +269,15 @@ def solve_scenes(model: FrameModel, scenes: Scenes, options: ExactOptions) -> tu
     def solve(block: tuple[str, list[int]]) -> None:
         """Solve the scenes of a block."""
         kind, numbers = block
-        some = take_stacks([scenes], np.array(numbers))
-        problem = model.problem(some, kind)
+        solved = take_stacks([scenes], np.array(numbers))
+        problem = model.problem(solved, kind)
         if model.scale == 1:
             deviations = PRIORS[options.prior](problem, options.regularisation)
         else:
             deviations, difference = finer_scene(problem, width, model.motion.neglected)
             differences.append(difference)
-        images.update(zip(numbers, deviations[..., : model.scale * width] + model.mean[some.stack[:, 0]], strict=True))
+        means = model.mean[solved.stack[:, 0]]
+        images.update(zip(numbers, deviations[..., : model.scale * width] + means, strict=True))
         advance(len(numbers))
 
     if torch.is_grad_enabled() and (model.images.requires_grad or model.motion.exposures[0].requires_grad):

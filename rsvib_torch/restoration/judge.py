@@ -278,8 +278,8 @@ def cut_pairs(moving: MovingFrames, restored: Tensor, common: CommonParts) -> Fr
     raw, raw_later = cut(moving.images, earlier, first), cut(moving.images, later, second)
     still = cut(restored, np.zeros_like(earlier) if single else earlier, first)
     still_later = still if single else cut(restored, later, second)
-    both = torch.stack([still, still_later], 1)
-    predicted, formed_later = reblur(both, moving.motion, common.stack, later, second[:, 0]).unbind(1)
+    stills = torch.stack([still, still_later], 1)
+    predicted, formed_later = reblur(stills, moving.motion, common.stack, later, second[:, 0]).unbind(1)
     changed = formed_later - still_later
     # 2. Predicted values at missing pixels, and the part that is compared.
     inner = (..., slice(rim_y, height - rim_y), slice(rim_x, width - rim_x))
@@ -356,8 +356,8 @@ def _judge_pairs(moving: MovingFrames, restored: Tensor, common: CommonParts, sh
     for n, ((raw_misfit, remaining, resolution), between, gain) in enumerate(measured):
         moves = common.moves[n].tolist()
         outcome, reasons = outcome_of_pair(raw_misfit, remaining, resolution, moves, between, gain, one_image=single)
-        stated = outcome == "unknown" or (gain <= 0 if outcome == "worse" else gain >= 0)
+        is_stated = outcome == "unknown" or (gain <= 0 if outcome == "worse" else gain >= 0)
         if pairs.missing[n] > _MAX_MISSING:
             outcome, reasons = "unknown", (Reason("pixels_missing", None, float(pairs.missing[n]), _MAX_MISSING),)
-        verdicts.append(PairVerdict(gain if stated else math.nan, displacements[n], outcome, reasons))
+        verdicts.append(PairVerdict(gain if is_stated else math.nan, displacements[n], outcome, reasons))
     return verdicts

@@ -229,8 +229,8 @@ def candidates(tones: list[_Tones], clock: CameraClock) -> list[Candidate]:
         distance = nu * inverse[:, None] - phi
         distance = distance - np.round(distance)
         variance = scale**2 * of_nu - scale * (mixed + mixed.T) + of_phi + _FLOOR**2 * np.eye(len(nu))
-        both = np.linalg.solve(variance, np.stack([distance, np.broadcast_to(nu, distance.shape)], -1))
-        return distance, both[..., 0], both[..., 1]
+        solved = np.linalg.solve(variance, np.stack([distance, np.broadcast_to(nu, distance.shape)], -1))
+        return distance, solved[..., 0], solved[..., 1]
 
     for _ in range(5):
         distance, _, by_nu = weighted()

@@ -417,8 +417,8 @@ class VibrationTracker:
                 break
             # Tones that the last frame contradicts are not used: without tones, the path is followed at least.
             plausible = _plausible(result)
-            for chosen in (plausible, torch.zeros_like(plausible)):
-                started = self._started(started, result, chosen, middle, times[-1] - times[0])
+            for kept in (plausible, torch.zeros_like(plausible)):
+                started = self._started(started, result, kept, middle, times[-1] - times[0])
                 if started.track is not None:
                     break
             if started.track is not None and started.contradictions == 0:

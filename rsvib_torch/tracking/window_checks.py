@@ -120,7 +120,7 @@ class _Readouts:
         interval = self.fit.interval
         most = max(interval / self.readout, 1.0)  # rows are not read in more time than there is between two frames
         proposed = sorted(part for wave in self.waves for part in wave.parts(interval, most))
-        others = [
+        distinct = [
             part
             for before, part in pairwise((-1.0, *proposed))
             if part > (1.0 + _SAME_PART) * before
@@ -129,18 +129,18 @@ class _Readouts:
                 or any(wave.alias(part, interval) != wave.alias(1.0, interval) for wave in self.waves)
             )
         ]
-        return [-1.0, 0.0, 1.0, *(others if self.waves else _WITHOUT_TONES)]
+        return [-1.0, 0.0, 1.0, *(distinct if self.waves else _WITHOUT_TONES)]
 
     def with_part(self, part: float, rounds: int) -> WindowFit:
         """The fit if rows take a part of the stated time."""
         fit = self.fit
         delay = (1.0 - part) * self.readout * (fit.corners.rows - 0.5)
-        other = WindowFit(replace(fit.corners, times=fit.corners.times - delay[:, None]), fit.interval, fit.averaged)
+        refitted = WindowFit(replace(fit.corners, times=fit.corners.times - delay[:, None]), fit.interval, fit.averaged)
         if part > 0.0:
-            other.add_tones(sorted({(wave.axis, wave.alias(part, fit.interval)) for wave in self.waves}))
-        other.layer, other.weights = fit.layer, fit.weights
-        other.solve(rounds)
-        return other
+            refitted.add_tones(sorted({(wave.axis, wave.alias(part, fit.interval)) for wave in self.waves}))
+        refitted.layer, refitted.weights = fit.layer, fit.weights
+        refitted.solve(rounds)
+        return refitted
 
 
 def _by_columns(fit: WindowFit, readout: float, timing: SensorTiming, size: tuple[int, int]) -> WindowFit:
@@ -176,8 +176,8 @@ def compared_readouts(fit: WindowFit, timing: SensorTiming, size: tuple[int, int
     # may do so by waves that have not been found as tones with the stated readout.
     unexplained = {(of, part): of.with_part(part, 1).unexplained for of in (rows, columns) for part in of.parts()}
     of, part = min(unexplained, key=lambda one: unexplained[one])
-    other = of.with_part(part, ROUNDS)
-    least = (_CONTRADICTED if of.waves else _BY_PATH) * other.unexplained
+    best = of.with_part(part, ROUNDS)
+    least = (_CONTRADICTED if of.waves else _BY_PATH) * best.unexplained
     if least > fit.unexplained or least > rows.with_part(1.0, ROUNDS).unexplained:
         most = _AS_WELL * fit.unexplained if fit.tones else 0.0
         agreeing = [part for (of, part), value in unexplained.items() if of is rows and 0 < part != 1 and value < most]
@@ -188,8 +188,8 @@ def compared_readouts(fit: WindowFit, timing: SensorTiming, size: tuple[int, int
     most = _CONTRADICTED * unexplained[of, part]
     as_good = sorted((value, one) for (its, one), value in unexplained.items() if its is of is rows and value < most)
     names = " or ".join([*dict.fromkeys(name(one) for _, one in as_good)][:3]) or "column by column"
-    other_readout = names, math.sqrt(fit.unexplained), math.sqrt(other.unexplained)
-    return replace(other.path(), other_readout=other_readout, part=part if of is rows else 0.0)
+    other_readout = names, math.sqrt(fit.unexplained), math.sqrt(best.unexplained)
+    return replace(best.path(), other_readout=other_readout, part=part if of is rows else 0.0)
 
 
 def blur_ratio(fit: WindowFit, timing: SensorTiming, size: tuple[int, int]) -> tuple[float, float]:
@@ -218,8 +218,8 @@ def blur_ratio(fit: WindowFit, timing: SensorTiming, size: tuple[int, int]) -> t
     stretch = np.eye(2) - speed[..., None] * across
     to_mean = np.linalg.inv(stretch.mean(1))[:, None]
     root = np.sqrt(weights)[:, None] * path  # M = root^T root
-    both = [to_mean @ root.swapaxes(-1, -2), to_mean @ stretch]
-    of_both = np.stack([part @ part.swapaxes(-1, -2) for part in both], 1)
+    blurs = [to_mean @ root.swapaxes(-1, -2), to_mean @ stretch]
+    of_both = np.stack([part @ part.swapaxes(-1, -2) for part in blurs], 1)
     changes = (of_both[:, :, 1] - of_both[:, :, 0]).reshape(-1, 2, 4)[..., [0, 1, 3]]
     # 3. Least squares for the ratio and the size of the filter, and for what the corners of each pair have in common.
     columns = np.concatenate([changes, np.broadcast_to(np.eye(3), (len(times), 3, 3))], 1)

@@ -298,8 +298,8 @@ class WindowFit:
         for tone in self.tones:
             without = copy(self)
             without.tones = [other for other in self.tones if other is not tone]
-            best, *others = without.with_aliases(tone.axis, tone.frequency, tone.slope, limits)
-            if others and others[0].unexplained < _DISTINCT * best.unexplained:
+            best, *worse = without.with_aliases(tone.axis, tone.frequency, tone.slope, limits)
+            if worse and worse[0].unexplained < _DISTINCT * best.unexplained:
                 return without
             if abs(best.tones[-1].frequency - tone.frequency) * self.interval > 0.5:
                 return best
@@ -312,10 +312,10 @@ class WindowFit:
         """
         if self.corners.layer.all():
             return self
-        other = copy(self)
-        other.layer, other.weights = self.corners.layer, self.corners.layer.astype(np.float64)
-        other.solve(ROUNDS)
-        return other if np.median(other.distance) < _EXPLAINS_MORE * np.median(self.distance) else self
+        layer_fit = copy(self)
+        layer_fit.layer, layer_fit.weights = self.corners.layer, self.corners.layer.astype(np.float64)
+        layer_fit.solve(ROUNDS)
+        return layer_fit if np.median(layer_fit.distance) < _EXPLAINS_MORE * np.median(self.distance) else self
 
     def keep_tones(self) -> None:
         """Leave out insignificant tones, and those that thirds of the rows or columns contradict."""

@@ -66,8 +66,8 @@ def part_detection(frames: VideoFrames, path: CameraPath, times: Array, part: sl
     ]
     against += exposure_reasons(frames.job.timing.in_row_order(), *window.blur)
     if window.other_readout is not None:
-        name, stated, other = window.other_readout
-        against.append(Reason("readout_contradicted", None, stated, other, {"other": name}))
+        name, by_stated, by_other = window.other_readout
+        against.append(Reason("readout_contradicted", None, by_stated, by_other, {"other": name}))
     if against:
         findings = tuple((*(one for one in of if one.code != "no_tone"), *against) for of in findings)
     timing, std = frames.job.timing, VibrationStd(*(torch.from_numpy(np.array(value)) for value in values))
@@ -141,8 +141,8 @@ def _findings(timing: SensorTiming, tones: list[Tone], window: WindowPath) -> tu
     for axis, name in enumerate(AXIS_NAMES[:2]):
         of_axis = [tone for tone in tones if tone.axis == axis]
         apart = max((tone.left_in_third for tone in window.tones if tone.axis == axis), default=0.0)
-        known = any(abs(tone.coefficient) > SIGNIFICANT * tone.amplitude_std for tone in of_axis)
-        against = aliases[:1] if known else [Reason("no_tone", name)]
+        is_significant = any(abs(tone.coefficient) > SIGNIFICANT * tone.amplitude_std for tone in of_axis)
+        against = aliases[:1] if is_significant else [Reason("no_tone", name)]
         if axis in largest:
             one = largest[axis]
             bends = [changed(one, one.bend(), 1 / SIGNIFICANT)] if one.bend() > one.size / SIGNIFICANT else []

@@ -81,14 +81,14 @@ def steady_shifts(
     before, after = np.diff(times)[:-1], np.diff(times)[1:]
     columns = np.stack([after, -before - after, before]) / (before * after * (before + after))
     columns *= 2 * (min(duration, times[-1] - times[0]) / math.pi) ** 2
-    parts = [slice(one, one + len(times) - 2) for one in range(3)]
+    parts = [slice(early, early + len(times) - 2) for early in range(3)]
     bent = sum(column[:, None] * path[part] for column, part in zip(columns, parts, strict=True))
     # 2. Normal equations, whose matrix is a band.
     right, band = np.zeros_like(path), np.zeros((3, len(times)))
-    for one, part in enumerate(parts):
-        right[part] -= columns[one][:, None] * bent
-        for other in range(one, 3):
-            band[other - one, part] += columns[one] * columns[other]
+    for early, part in enumerate(parts):
+        right[part] -= columns[early][:, None] * bent
+        for late in range(early, 3):
+            band[late - early, part] += columns[early] * columns[late]
     # 3. Weights that keep the limit.
     weights = np.ones(len(times))
     for _ in range(_ROUNDS):

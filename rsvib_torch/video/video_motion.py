@@ -141,7 +141,7 @@ class VideoMotion:
         indices = range(first, min(first + PART_FRAMES, len(self.frames.starts)))
         tracks = [FrameTrack(index, self.removed(index), self.first_pass.faults.get(index)) for index in indices]
         shaking = self._shaking(tracks)
-        is_worse = any(shakes_more(*both) for both in shaking.values()) if shaking else not self.is_explained(number)
+        is_worse = any(shakes_more(*pair) for pair in shaking.values()) if shaking else not self.is_explained(number)
         if not is_worse or not isinstance(self.path, CameraPath):
             return VideoPart(number, tracks, shaking)
         tracks = [  # rows are not moved apart
@@ -182,8 +182,8 @@ class VideoMotion:
         for pair in pairwise(tracks[:CHECKED_FRAMES]):
             raw = self.first_pass.corners.get(pair[0].index)
             if raw is not None:
-                both = shake(raw), shake(self._restored_corners(pair, raw))
-                measured[pair[0].index] = np.array([[*steps, rows] for steps, rows in both])
+                shakes = shake(raw), shake(self._restored_corners(pair, raw))
+                measured[pair[0].index] = np.array([[*steps, rows] for steps, rows in shakes])
         changes = [measured[index + 1] - measured[index] for index in measured if index + 1 in measured]
         if not changes:
             return None
