@@ -25,7 +25,7 @@ from rsvib_torch.detection.tones.fit import (
     shrunk,
     tone_displacements,
 )
-from rsvib_torch.detection.tones.selection import find_tones
+from rsvib_torch.detection.tones.selection import LONG_GAP, find_tones, with_best_cycles
 from rsvib_torch.detection.tones.uncertainty import (
     with_further_tones,
     with_unknown_amplitudes,
@@ -125,6 +125,9 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
     intervals = compared_intervals(timing, num_frames, MAX_GROUP_FRAMES if directly else 2)
     row_starts = table(timing.row_starts(num_frames, height)[:, ::8].flatten())
     measurements, fit, refined = fitted.measurements, fitted.fit, fitted.refined
+    gaps = table(timing.frame_starts(num_frames).diff())
+    if len(gaps) and gaps.max() > LONG_GAP * gaps.min():
+        fit = with_best_cycles(measurements, fit, float(gaps.max()))
     if refined is not None:
         fit = without_aliasing(measurements, fit, refined.aliasing)
         unexplained, span = refined.other_motion.unexplained, measurements.span

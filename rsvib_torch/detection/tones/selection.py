@@ -91,6 +91,44 @@ def with_best_aliases(
     return fit
 
 
+# Cycles within a gap that are tried on either side of a tone. The next best number leaves 3 to 130 times what the right
+# one leaves; where it left less than 1.8 times as much, 5 of 6 axes that bands called reliable were wrong. Of 37 axes
+# that were reliable by rows, with a gap of 5 to 150 frame periods, 4 were wrong by one cycle without this
+_CYCLES, _DISTINCT = np.array([-3, -2, -1, 1, 2, 3]), 2.0
+LONG_GAP = 4.0  # shortest intervals of frames
+
+
+def with_best_cycles(measurements: Measurements, fit: ToneFit, gap: float) -> ToneFit:
+    """The fit with the number of cycles of every tone within a gap in s between frames that leaves the least.
+
+    Tones that differ by a cycle within the gap differ little in the frames before and behind it. The variance of the
+    frequency contains a cycle where another number leaves less than twice as much.
+    """
+    count, axes = fit.frequencies.shape[:2]
+    stacks, of_axis = np.repeat(np.arange(count), len(_CYCLES)), fit.covariance.shape[-1] // axes
+    trial, doubts = take_stacks([measurements], stacks), np.zeros((count, axes, of_axis))
+    for axis, tone in np.argwhere(fit.active.any(0)):
+        # 1. What other numbers of cycles leave, unless their fits end at the frequency of this one.
+        size = median(measurements.sizes(residual_of(measurements, fit)), 1)[:, axis]
+        frequencies = fit.frequencies[stacks]
+        before = frequencies[:, axis, tone].copy()
+        frequencies[:, axis, tone] = np.abs(before + np.tile(_CYCLES / gap, count))
+        others, residual = fit_roughly(trial, frequencies, fit.active[stacks], fit.drift_order)
+        sizes = without_nan(median(trial.sizes(residual), 1), np.inf)[:, axis]
+        sizes = np.where(np.abs(others.frequencies[:, axis, tone] - before) * gap < 0.5, np.inf, sizes)
+        sizes = np.concatenate([size[:, None], sizes.reshape(count, -1)], 1)
+        # 2. The best number, and whether another one is as good.
+        best, ordered = sizes.argmin(1), np.sort(sizes, 1)
+        doubts[:, axis, 3 * tone + 2] = (ordered[:, 1] < _DISTINCT * ordered[:, 0]) & fit.active[:, axis, tone]
+        better = (best > 0) & fit.active[:, axis, tone]
+        if better.any():
+            frequencies = fit.frequencies.copy()
+            frequencies[better] = others.frequencies[(np.arange(count) * len(_CYCLES) + best - 1)[better]]
+            fit = fit_tones(measurements, frequencies, fit.active, fit.drift_order)
+    variance = (doubts / gap**2).reshape(count, -1)
+    return replace(fit, covariance=fit.covariance + variance[..., None] * np.eye(variance.shape[-1]))
+
+
 def typical_size(measurements: Measurements, fit: ToneFit) -> Array:
     """(B,) median square of the normalised residual of both axes, which stretches of outliers hardly raise."""
     return np.square(median(measurements.sizes(residual_of(measurements, fit)), 1)).sum(-1)
